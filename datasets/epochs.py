@@ -1,0 +1,148 @@
+"""Cut a log into epochs, in the order of reception, as a vehicle would live through it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .log import AttitudeStream, Log
+from .state import TimeArray
+
+DVL, DEPTH, GPS, HEADING, ATTITUDE = range(5)
+KIND = {"dvl": DVL, "depth": DEPTH, "gps": GPS, "heading": HEADING, "attitude": ATTITUDE}
+SENSOR = ("dvl", "depth", "gps", "heading", "heading")
+"""Sensor name by kind; a full attitude comes from the heading sensor."""
+
+IMU_SAMPLE = np.dtype(
+    [
+        ("t_ns", "i8"),  # end of the interval
+        ("dt_s", "f8"),  # its length
+        ("held_s", "f8"),  # how much of it bridges a gap, the sample being held
+        ("w_WI_I", "f8", (3,)),
+        ("f_I", "f8", (3,)),
+    ]
+)
+READING = np.dtype([("kind", "i8"), ("t_ns", "i8"), ("received_ns", "i8"), ("z", "f8", (9,)), ("sigma", "f8", (3,))])
+
+GAP_FACTOR = 1.5
+"""An interval longer than this many sampling periods is a gap."""
+
+
+class Epoch(NamedTuple):
+    """What a vehicle learns between two moments of its clock.
+
+    Attributes:
+        t_ns: the later moment.
+        imu: IMU_SAMPLE rows that cover the time since the epoch before, exactly: a sample that straddles a moment is
+            split there. So an epoch waits for the sample that covers its end, at most one interval of the IMU.
+        readings: READING rows received at t_ns, each true then or earlier.
+        tick: the harness will ask for a belief now.
+    """
+
+    t_ns: int
+    imu: NDArray[Any]
+    readings: NDArray[Any]
+    tick: bool
+
+
+@dataclass(frozen=True)
+class Voyage:
+    """A log cut into epochs.
+
+    Attributes:
+        epochs: in the order of reception.
+        start_ns: where the first IMU block begins.
+        counts: how many IMU gaps were bridged and how many readings lay outside the IMU's time.
+        failure: why the voyage ends early, with the time, or None.
+    """
+
+    epochs: list[Epoch]
+    start_ns: int
+    counts: dict[str, int]
+    failure: str | None
+
+
+def reading_table(log: Log, sensors: Collection[str] | None = None) -> NDArray[Any]:
+    """Stack the log's readings into one READING array, in the order of reception (then of truth, then of kind)."""
+    tables = []
+    for sensor, stream in log.streams.items():
+        if sensors is not None and sensor not in sensors:
+            continue
+        table = np.zeros(len(stream), READING)
+        table["kind"] = ATTITUDE if isinstance(stream, AttitudeStream) else KIND[sensor]
+        table["t_ns"], table["received_ns"] = stream.t_ns, stream.received_ns
+        table["z"][:, : stream.width] = stream.z
+        table["sigma"] = np.inf
+        table["sigma"][:, : stream.residual_width] = stream.sigma
+        tables.append(table)
+    if not tables:
+        return np.zeros(0, READING)
+    table = np.concatenate(tables)
+    return table[np.lexsort((table["kind"], table["t_ns"], table["received_ns"]))]
+
+
+def cut(
+    log: Log, ticks_ns: TimeArray | None = None, sensors: Collection[str] | None = None, max_gap_s: float = 1.0
+) -> Voyage:
+    """Cut the log at every reception and at every tick.
+
+    Args:
+        log: what to cut; starts at its prior's time, or at its first IMU sample.
+        ticks_ns: (k,) increasing; moments at which a belief will be asked for. Those outside the IMU's time are
+            passed over.
+        sensors: aiding sensors to keep; all when None.
+        max_gap_s: longest gap in the IMU that is bridged (its last sample held, its covariance grown). A longer one
+            ends the voyage, and `failure` says so.
+    """
+    start_ns, end_ns = log.start_ns, int(log.imu.t_ns[-1])
+    failure, end_ns, gaps = _first_long_gap(log, start_ns, end_ns, max_gap_s)
+
+    readings = reading_table(log, sensors)
+    inside = (readings["t_ns"] > start_ns) & (readings["received_ns"] <= end_ns)
+    outside, readings = int(np.count_nonzero(~inside)), readings[inside]
+    ticks = np.zeros(0, np.int64) if ticks_ns is None else ticks_ns[(ticks_ns > start_ns) & (ticks_ns <= end_ns)]
+
+    times = np.union1d(readings["received_ns"], ticks)
+    samples = _imu_table(log, times, start_ns, end_ns)
+    imu_stop = np.searchsorted(samples["t_ns"], times, side="right").tolist()
+    reading_stop = np.searchsorted(readings["received_ns"], times, side="right").tolist()
+    is_tick = np.isin(times, ticks).tolist()
+
+    epochs, i, r = [], 0, 0
+    for t_ns, i_stop, r_stop, tick in zip(times.tolist(), imu_stop, reading_stop, is_tick, strict=True):
+        epochs.append(Epoch(t_ns, samples[i:i_stop], readings[r:r_stop], tick))
+        i, r = i_stop, r_stop
+    return Voyage(epochs, start_ns, {"imu_gaps_bridged": gaps, "readings_outside": outside}, failure)
+
+
+def _first_long_gap(log: Log, start_ns: int, end_ns: int, max_gap_s: float) -> tuple[str | None, int, int]:
+    """Return (failure, end of the usable IMU data, gaps bridged before it)."""
+    t_ns = log.imu.t_ns
+    step = np.diff(t_ns)
+    after = t_ns[1:] > start_ns
+    long = np.flatnonzero(after & (step > max_gap_s * 1e9))
+    failure = None
+    if len(long):
+        end_ns = int(t_ns[long[0]])
+        failure = f"imu gap at {(end_ns - start_ns) * 1e-9:.3f} s: {step[long[0]] * 1e-9:.3f} s without a sample"
+    bridged = after & (t_ns[1:] <= end_ns) & (step > GAP_FACTOR * log.imu.period_ns)
+    return failure, end_ns, int(np.count_nonzero(bridged))
+
+
+def _imu_table(log: Log, times: TimeArray, start_ns: int, end_ns: int) -> NDArray[Any]:
+    """Return the samples after start_ns as IMU_SAMPLE rows, split at `times`."""
+    imu = log.imu
+    own = imu.t_ns[(imu.t_ns > start_ns) & (imu.t_ns <= end_ns)]
+    t_ns = np.union1d(own, times[times <= end_ns])
+    source = np.searchsorted(imu.t_ns, t_ns)
+    interval = np.diff(imu.t_ns, prepend=imu.t_ns[0] - imu.period_ns)
+    table = np.zeros(len(t_ns), IMU_SAMPLE)
+    table["t_ns"] = t_ns
+    table["dt_s"] = np.diff(t_ns, prepend=start_ns) * 1e-9
+    table["held_s"] = np.where(interval[source] > GAP_FACTOR * imu.period_ns, table["dt_s"], 0.0)
+    table["w_WI_I"], table["f_I"] = imu.w_WI_I[source], imu.f_I[source]
+    return table

@@ -1,0 +1,205 @@
+"""A log: streams of readings in SI units and our frames, the rig they were taken with, and the truth if known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from .errors import DatasetError
+from .rig import Rig
+from .state import Array, Belief, TimeArray
+from .trajectory import Trajectory
+
+
+def check_rows(stream: str, t_ns: TimeArray, columns: Mapping[str, Array], *, strict: bool) -> None:
+    """Refuse times out of order and values that are not finite.
+
+    Args:
+        stream: name used in the error.
+        t_ns: (n,) times.
+        columns: name to (n,) or (n, k) values.
+        strict: times must increase; otherwise two rows may share one.
+
+    Raises:
+        DatasetError: naming stream, row, and value.
+    """
+    for name, values in columns.items():
+        if len(values) != len(t_ns):
+            raise DatasetError(f"{stream}: {len(t_ns)} times but {len(values)} rows of {name}")
+        bad = np.flatnonzero(~np.isfinite(np.asarray(values).reshape(len(t_ns), -1)).all(axis=1)) if len(t_ns) else []
+        if len(bad):
+            raise DatasetError(
+                f"{stream}: row {bad[0]} ({len(bad)} in all): {name} is {values[bad[0]]}; --repair drops such rows"
+            )
+    step = np.diff(t_ns)
+    bad = np.flatnonzero(step <= 0 if strict else step < 0)
+    if len(bad):
+        row = int(bad[0]) + 1
+        how = "repeats" if step[row - 1] == 0 else "comes before"
+        raise DatasetError(
+            f"{stream}: row {row} ({len(bad)} in all): time {t_ns[row]} {how} the row above; --repair drops such rows"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ImuStream:
+    """Inertial samples; each is the mean over the interval that ends at its time.
+
+    Attributes:
+        t_ns: (n,) end of each sample's interval, increasing.
+        w_WI_I: (n, 3) rad/s, gyro, in the IMU's axes.
+        f_I: (n, 3) m/s², specific force, in the IMU's axes.
+    """
+
+    t_ns: TimeArray
+    w_WI_I: Array
+    f_I: Array
+
+    def __post_init__(self) -> None:
+        if len(self.t_ns) < 2:
+            raise DatasetError(f"imu: {len(self.t_ns)} samples; at least two are needed")
+        check_rows("imu", self.t_ns, {"gyro": self.w_WI_I, "accel": self.f_I}, strict=True)
+
+    @property
+    def period_ns(self) -> int:
+        """Median sampling interval."""
+        return int(np.median(np.diff(self.t_ns)))
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingStream:
+    """Readings of one aiding sensor.
+
+    Attributes:
+        t_ns: (n,) when each was true, in order.
+        received_ns: (n,) when each came; never before it was true.
+        z: (n, k) what was read: dvl v_WB_B m/s (k = 3), depth z_W m (1, up positive), gps p_WG_W m (3),
+            heading psi rad (1: yaw of the sensor's x axis, counter-clockwise from east), attitude R_WH (9, by rows).
+        sigma: (n, m) standard deviation of each component of the residual (m = 3, 1, 3, 1, 3), inf where that
+            component was not measured.
+    """
+
+    name: ClassVar[str]
+    width: ClassVar[int]
+    residual_width: ClassVar[int]
+
+    t_ns: TimeArray
+    received_ns: TimeArray
+    z: Array
+    sigma: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.t_ns)
+        if self.z.shape != (n, self.width) or self.sigma.shape != (n, self.residual_width):
+            raise DatasetError(
+                f"{self.name}: expected z ({n}, {self.width}) and sigma ({n}, {self.residual_width}), "
+                f"found {self.z.shape} and {self.sigma.shape}"
+            )
+        check_rows(self.name, self.t_ns, {"value": self.z}, strict=True)
+        bad = np.flatnonzero(~(self.sigma > 0).all(axis=1))
+        if len(bad):
+            raise DatasetError(f"{self.name}: row {bad[0]}: sigma must be positive, found {self.sigma[bad[0]]}")
+        early = np.flatnonzero(self.received_ns < self.t_ns)
+        if len(early):
+            raise DatasetError(f"{self.name}: row {early[0]} was received before it was true")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+class DvlStream(ReadingStream):
+    """Bottom-track velocity of B, in B axes (equation 4)."""
+
+    name, width, residual_width = "dvl", 3, 3
+
+
+class DepthStream(ReadingStream):
+    """Height of the pressure sensor in W, up positive (equation 1)."""
+
+    name, width, residual_width = "depth", 1, 1
+
+
+class GpsStream(ReadingStream):
+    """Position of the antenna in W (equation 2)."""
+
+    name, width, residual_width = "gps", 3, 3
+
+
+class HeadingStream(ReadingStream):
+    """Yaw of the heading sensor's x axis; only that (the yaw residual)."""
+
+    name, width, residual_width = "heading", 1, 1
+
+
+class AttitudeStream(ReadingStream):
+    """Full attitude R_WH of the heading sensor (equation 3); counts as the sensor "heading"."""
+
+    name, width, residual_width = "attitude", 9, 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        R = self.z.reshape(-1, 3, 3)
+        bad = np.flatnonzero(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
+        if len(bad):
+            raise DatasetError(f"attitude: row {bad[0]} ({len(bad)} in all) is not a rotation; --repair drops such rows")
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One voyage.
+
+    Attributes:
+        name: what tables call it.
+        rig: extrinsics, noise, gravity.
+        imu: inertial samples; every log has them.
+        dvl, depth, gps, heading: aiding sensors, each None where the vehicle has none.
+        truth: what scores compare with; None where nobody knows.
+        truth_kind: "truth", or "reference" where it is another filter's output; tables repeat it.
+        prior: belief at the start, where the log's maker states one (simulations do); else `initialise` makes it.
+        notes: what was repaired, converted, counted or fitted on the way in, in sentences.
+        origin: (latitude °, longitude °) of W's origin, where the log is geodetic.
+    """
+
+    name: str
+    rig: Rig
+    imu: ImuStream
+    dvl: DvlStream | None = None
+    depth: DepthStream | None = None
+    gps: GpsStream | None = None
+    heading: HeadingStream | AttitudeStream | None = None
+    truth: Trajectory | None = None
+    truth_kind: str = "truth"
+    prior: Belief | None = None
+    notes: tuple[str, ...] = ()
+    origin: tuple[float, float] | None = None
+
+    @property
+    def streams(self) -> dict[str, ReadingStream]:
+        """The aiding streams that are there, by sensor name."""
+        every = {"dvl": self.dvl, "depth": self.depth, "gps": self.gps, "heading": self.heading}
+        return {name: stream for name, stream in every.items() if stream is not None}
+
+    @property
+    def start_ns(self) -> int:
+        """Where the voyage begins: the prior's time, else the start of the first IMU sample's interval."""
+        return self.prior.t_ns if self.prior is not None else int(self.imu.t_ns[0]) - self.imu.period_ns
+
+    @property
+    def duration_s(self) -> float:
+        """From the start to the last IMU sample, s."""
+        return (int(self.imu.t_ns[-1]) - self.start_ns) * 1e-9
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the log's own arrays (IMU and readings), bytes."""
+        arrays = [self.imu.t_ns, self.imu.w_WI_I, self.imu.f_I]
+        for stream in self.streams.values():
+            arrays += [stream.t_ns, stream.received_ns, stream.z, stream.sigma]
+        return sum(array.nbytes for array in arrays)
+
+    def with_prior(self, prior: Belief) -> Log:
+        """Return this log, starting from `prior`."""
+        return replace(self, prior=prior)

@@ -1,0 +1,76 @@
+"""The navigation state, its error coordinates, and a belief: a state with its covariance.
+
+The error state has fifteen components, in this order everywhere: theta (R_WB exp(theta), rad, in B), p (m, in W),
+v (m/s, in W), b_a (m/s²) and b_g (rad/s), both in the IMU's axes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array: TypeAlias = NDArray[np.float64]
+TimeArray: TypeAlias = NDArray[np.int64]
+
+THETA = slice(0, 3)
+POSITION = slice(3, 6)
+VELOCITY = slice(6, 9)
+ACCEL_BIAS = slice(9, 12)
+GYRO_BIAS = slice(12, 15)
+DIM = 15
+
+
+@dataclass(frozen=True, eq=False)
+class NavState:
+    """Pose and velocity of the body B in the world W (east-north-up), and the IMU's biases.
+
+    Attributes:
+        R_WB: (3, 3) rotation taking B components to W components.
+        p_WB_W: (3,) m.
+        v_WB_W: (3,) m/s.
+        b_a: (3,) m/s², in the IMU's axes.
+        b_g: (3,) rad/s, in the IMU's axes.
+    """
+
+    R_WB: Array
+    p_WB_W: Array
+    v_WB_W: Array
+    b_a: Array
+    b_g: Array
+
+    dim = DIM
+
+    def retract(self, error: Array) -> NavState:
+        """Return this state ⊕ error, error (15,) in the order of this module."""
+        return NavState(
+            self.R_WB @ Rotation.from_rotvec(error[THETA]).as_matrix(),
+            self.p_WB_W + error[POSITION],
+            self.v_WB_W + error[VELOCITY],
+            self.b_a + error[ACCEL_BIAS],
+            self.b_g + error[GYRO_BIAS],
+        )
+
+    def local(self, other: NavState) -> Array:
+        """Return the error (15,) with self ⊕ error = other."""
+        return np.concatenate(
+            [
+                Rotation.from_matrix(self.R_WB.T @ other.R_WB).as_rotvec(),
+                other.p_WB_W - self.p_WB_W,
+                other.v_WB_W - self.v_WB_W,
+                other.b_a - self.b_a,
+                other.b_g - self.b_g,
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A state at t_ns with the covariance P (15, 15) of its error; P is NaN where the estimator keeps none."""
+
+    t_ns: int
+    state: NavState
+    P: Array

@@ -1,0 +1,194 @@
+"""A trajectory: arrays of states over time, and how much of the future they have seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .errors import DatasetError
+from .state import Array, Belief, NavState, TimeArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """States of B in W over time.
+
+    Attributes:
+        t_ns: (n,) increasing.
+        R_WB: (n, 3, 3).
+        p_WB_W: (n, 3) m.
+        v_WB_W: (n, 3) m/s, where known.
+        b_a, b_g: (n, 3) m/s² and rad/s in the IMU's axes, where known.
+        P: (n, 15, 15) covariance of the error state, where kept; rows of NaN where it was not asked for.
+        lookahead_s: how much of the future each state has seen: 0 for a filter, the lag for a fixed-lag smoother,
+            infinity for a batch.
+    """
+
+    t_ns: TimeArray
+    R_WB: Array
+    p_WB_W: Array
+    v_WB_W: Array | None = None
+    b_a: Array | None = None
+    b_g: Array | None = None
+    P: Array | None = None
+    lookahead_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        n = len(self.t_ns)
+        shapes = {"R_WB": (n, 3, 3), "p_WB_W": (n, 3), "v_WB_W": (n, 3), "b_a": (n, 3), "b_g": (n, 3), "P": (n, 15, 15)}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values is not None and values.shape != shape:
+                raise DatasetError(f"trajectory: {name} has shape {values.shape}, expected {shape}")
+        if n > 1 and (np.diff(self.t_ns) <= 0).any():
+            row = int(np.flatnonzero(np.diff(self.t_ns) <= 0)[0]) + 1
+            raise DatasetError(f"trajectory: row {row}: time {self.t_ns[row]} is not after the row above")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, rows: Array | TimeArray | slice) -> Trajectory:
+        """Return the rows given by a mask, indices or a slice."""
+
+        def pick(values: Array | None) -> Array | None:
+            return None if values is None else values[rows]
+
+        return Trajectory(
+            self.t_ns[rows],
+            self.R_WB[rows],
+            self.p_WB_W[rows],
+            pick(self.v_WB_W),
+            pick(self.b_a),
+            pick(self.b_g),
+            pick(self.P),
+            self.lookahead_s,
+        )
+
+    def state(self, row: int) -> NavState:
+        """Return one row as a state; what is not known is zero."""
+        zero = np.zeros(3)
+        return NavState(
+            self.R_WB[row],
+            self.p_WB_W[row],
+            zero if self.v_WB_W is None else self.v_WB_W[row],
+            zero if self.b_a is None else self.b_a[row],
+            zero if self.b_g is None else self.b_g[row],
+        )
+
+    @classmethod
+    def from_beliefs(cls, beliefs: list[Belief], lookahead_s: float = 0.0) -> Trajectory:
+        """Stack beliefs, in time order; P is None where no belief has a covariance."""
+        P = np.array([b.P for b in beliefs]).reshape(-1, 15, 15)
+        return cls(
+            np.array([b.t_ns for b in beliefs], dtype=np.int64),
+            np.array([b.state.R_WB for b in beliefs]).reshape(-1, 3, 3),
+            np.array([b.state.p_WB_W for b in beliefs]).reshape(-1, 3),
+            np.array([b.state.v_WB_W for b in beliefs]).reshape(-1, 3),
+            np.array([b.state.b_a for b in beliefs]).reshape(-1, 3),
+            np.array([b.state.b_g for b in beliefs]).reshape(-1, 3),
+            P if np.isfinite(P[:, 0, 0]).any() else None,
+            lookahead_s,
+        )
+
+    def to_tum(self, path: Path | str) -> None:
+        """Write `t x y z qx qy qz qw` lines (TUM format): s, m, quaternion of R_WB; seconds with nine decimals."""
+        q_xyzw = Rotation.from_matrix(self.R_WB).as_quat(canonical=True)
+        with Path(path).open("w") as file:
+            for t_ns, p, q in zip(self.t_ns.tolist(), self.p_WB_W.tolist(), q_xyzw.tolist(), strict=True):
+                seconds, rest = divmod(t_ns, 1_000_000_000)
+                file.write(f"{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
+
+    @classmethod
+    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0) -> Trajectory:
+        """Read a TUM file; times keep their nanoseconds.
+
+        Raises:
+            DatasetError: no such file, a row without eight numbers, a quaternion more than 1e-3 from unit length,
+                or times out of order.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise DatasetError(f"{path}: no such file")
+        t_ns: list[int] = []
+        rows: list[list[float]] = []
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+            fields = line.replace(",", " ").split()
+            if not fields or fields[0].startswith("#"):
+                continue
+            try:
+                t_ns.append(seconds_to_ns(fields[0]))
+                rows.append([float(x) for x in fields[1:]])
+            except (ValueError, OverflowError):
+                raise DatasetError(f"{path}: line {number}: not numbers: {line[:60]!r}") from None
+            if len(rows[-1]) != 7:
+                raise DatasetError(f"{path}: line {number}: expected t x y z qx qy qz qw, found {len(fields)} fields")
+            length = float(np.linalg.norm(rows[-1][3:]))
+            if not (np.isfinite(rows[-1]).all() and abs(length - 1) < 1e-3):
+                raise DatasetError(f"{path}: line {number}: not a finite pose with a unit quaternion (|q| = {length:.6g})")
+        if not rows:
+            raise DatasetError(f"{path}: no poses; expected lines of t x y z qx qy qz qw")
+        values = np.array(rows)
+        return cls(
+            np.array(t_ns, dtype=np.int64),
+            Rotation.from_quat(values[:, 3:]).as_matrix(),
+            values[:, :3],
+            lookahead_s=lookahead_s,
+        )
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return one row per state: t_ns, R_WB_00.., p_WB_W_x.., and v, b_a, b_g and P_00.. where known."""
+        import pandas as pd
+
+        columns: dict[str, Array | TimeArray] = {"t_ns": self.t_ns}
+        for i in range(3):
+            for j in range(3):
+                columns[f"R_WB_{i}{j}"] = self.R_WB[:, i, j]
+        for name in ("p_WB_W", "v_WB_W", "b_a", "b_g"):
+            values = getattr(self, name)
+            if values is not None:
+                columns |= {f"{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
+        if self.P is not None:
+            columns |= {f"P_{i}_{j}": self.P[:, i, j] for i in range(15) for j in range(i, 15)}
+        return pd.DataFrame(columns)
+
+    @classmethod
+    def from_pandas(cls, table: pd.DataFrame, lookahead_s: float = 0.0) -> Trajectory:
+        """Inverse of `to_pandas`."""
+
+        def vectors(name: str) -> Array | None:
+            return table[[f"{name}_{a}" for a in "xyz"]].to_numpy(float) if f"{name}_x" in table else None
+
+        R = np.stack([table[f"R_WB_{i}{j}"].to_numpy(float) for i in range(3) for j in range(3)], axis=1)
+        p = vectors("p_WB_W")
+        assert p is not None
+        P = None
+        if "P_0_0" in table:
+            P = np.empty((len(table), 15, 15))
+            for i in range(15):
+                for j in range(i, 15):
+                    P[:, i, j] = P[:, j, i] = table[f"P_{i}_{j}"].to_numpy(float)
+        return cls(
+            table["t_ns"].to_numpy(np.int64), R.reshape(-1, 3, 3), p, vectors("v_WB_W"), vectors("b_a"), vectors("b_g"),
+            P, lookahead_s,
+        )  # fmt: skip
+
+
+def seconds_to_ns(text: str) -> int:
+    """Convert decimal seconds, as text, to nanoseconds without passing through float64.
+
+    Raises:
+        ValueError, OverflowError: not a finite number.
+    """
+    from decimal import Decimal, InvalidOperation
+
+    try:
+        return int((Decimal(text) * 1_000_000_000).to_integral_value())
+    except InvalidOperation:
+        raise ValueError(f"not a time in seconds: {text!r}") from None
