@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections import Counter
+from typing import Any, Literal
 
 import numpy as np
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import ATTITUDE, DEPTH, DVL, HEADING, Epoch
+from ..datasets.epochs import ATTITUDE, DEPTH, DVL, HEADING, SENSOR, Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief, NavState
+from ..datasets.trajectory import Trajectory
+from .dvl_preintegration import preintegrate_dvl
+from .imu import compile_rig
 from .interface import FACTORS
+from .so3 import exp
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,69 @@ class DeadReckoning:
 
 
 class DeadReckoningPass:
-    """One pass of `DeadReckoning`."""
+    """One pass of `DeadReckoning`; it keeps no covariance."""
 
     def __init__(self, config: DeadReckoning, prior: Belief, rig: Rig) -> None:
-        raise NotImplementedError
+        self.counts: Counter[str] = Counter()
+        self._config = config
+        self._rig = rig
+        self._records = compile_rig(rig, config.factors, {})
+        self._t_ns = prior.t_ns
+        self._prior = prior.state
+        self._R_WB, self._p_WB_W = prior.state.R_WB, prior.state.p_WB_W
+        self._v_WB_B = prior.state.R_WB.T @ prior.state.v_WB_W
+        self._newest_ns = dict.fromkeys(range(5), prior.t_ns)
+
+    def step(self, epoch: Epoch) -> None:
+        """See `Pass.step`. A reading that comes late is taken as if it were of now, unless a newer one is known."""
+        if len(epoch.imu):
+            held_ns = np.array([self._t_ns])
+            rate_bias = self._prior.b_g
+            imu = epoch.imu
+            if self._config.attitude == "heading":  # nothing turns between two headings
+                imu = imu.copy()
+                imu["w_WI_I"] = rate_bias
+            dp, _ = preintegrate_dvl(
+                imu, self._t_ns, held_ns, self._v_WB_B[None], np.zeros((1, 3)), rate_bias, self._records, False
+            )
+            self._p_WB_W = self._p_WB_W + self._R_WB @ dp
+            if self._config.attitude == "gyro":
+                for sample in imu:
+                    self._R_WB = self._R_WB @ exp(self._rig.imu.R_BS @ (sample["w_WI_I"] - rate_bias) * sample["dt_s"])
+        for reading in epoch.readings:
+            self._take(reading)
+        self._t_ns = epoch.t_ns
+
+    def belief(self) -> Belief:
+        """See `Pass.belief`."""
+        state = NavState(self._R_WB, self._p_WB_W, self._R_WB @ self._v_WB_B, self._prior.b_a, self._prior.b_g)
+        return Belief(self._t_ns, state, np.full((15, 15), np.nan))
+
+    def finish(self) -> Trajectory | None:
+        """It has no hindsight."""
+        return None
+
+    def _take(self, reading: Any) -> None:
+        kind, z = int(reading["kind"]), reading["z"]
+        if SENSOR[kind] not in self._config.factors:
+            return
+        if reading["t_ns"] <= self._newest_ns[kind]:
+            self.counts["late"] += 1
+            return
+        self._newest_ns[kind] = int(reading["t_ns"])
+        if kind == DVL:
+            measured = np.isfinite(reading["sigma"])
+            self._v_WB_B = np.where(measured, z[:3], self._v_WB_B)
+        elif kind == DEPTH:
+            lever_m = (self._R_WB @ self._rig.depth.p_BS_B)[2]
+            self._p_WB_W = np.array([self._p_WB_W[0], self._p_WB_W[1], z[0] - lever_m])
+        elif self._config.attitude == "heading" and kind == HEADING:
+            self._R_WB = level(z[0], self._rig.heading.R_BS)
+        elif self._config.attitude == "heading" and kind == ATTITUDE:
+            self._R_WB = z.reshape(3, 3) @ self._rig.heading.R_BS.T
+
+
+def level(yaw_rad: float, R_BH: Array) -> Array:
+    """Return the level R_WB (3, 3) at which the x axis of the heading sensor has this yaw."""
+    offset_rad = np.arctan2(R_BH[1, 0], R_BH[0, 0])
+    return exp(np.array([0.0, 0.0, yaw_rad - offset_rad]))

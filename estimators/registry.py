@@ -9,10 +9,14 @@ from pydantic import ValidationError
 
 from ..datasets.errors import nearest
 from .dead_reckoning import DeadReckoning
+from .eskf import ErrorStateKalmanFilter
+from .fixed_lag import FixedLagSmoother
 from .interface import Estimator
 
 ESTIMATORS: dict[str, Any] = {
     "dead-reckoning": DeadReckoning,
+    "eskf": ErrorStateKalmanFilter,
+    "fls": FixedLagSmoother,
 }
 
 

@@ -1,0 +1,234 @@
+"""The command `fathom`. Heavy imports wait inside the commands, so that `fathom --help` answers at once."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..datasets.scenario import Scenario
+
+app = typer.Typer(
+    help="Filter or smoother? A benchmark for underwater navigation.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+
+
+class Listing(StrEnum):
+    """What `fathom list` can list."""
+
+    estimators = "estimators"
+    logs = "logs"
+    experiments = "experiments"
+    scores = "scores"
+
+
+class Align(StrEnum):
+    """What an estimate is forgiven before it is scored."""
+
+    none = "none"
+    origin = "origin"
+    yaw = "yaw"
+    se3 = "se3"
+
+
+Data = Annotated[Path | None, typer.Option(envvar="FATHOM_DATA", help="Where recorded logs are.")]
+Repair = Annotated[bool, typer.Option("--repair", help="Drop bad rows of logs, and count them.")]
+
+
+@app.command()
+def run(
+    experiment: Annotated[str, typer.Argument(help="A shipped experiment's name, or a YAML file.")],
+    data: Data = None,
+    out: Annotated[Path, typer.Option(help="Where results go.")] = Path("results"),
+    jobs: Annotated[int, typer.Option(min=0, help="Worker processes; 0: one per core.")] = 0,
+    only: Annotated[
+        str | None, typer.Option(help="Pattern: an estimator's label, a log's name, or \"log/label\".")
+    ] = None,
+    repair: Repair = False,
+) -> None:
+    """Run every estimator of EXPERIMENT on every one of its logs, and print the table."""
+    with refusing_bad_input():
+        from .experiment import Experiment
+        from .runner import run_experiment
+
+        plan = Experiment.load(experiment)
+        folder = out / plan.name
+        try:
+            rows = run_experiment(plan, data, out, jobs, only, repair)
+        except KeyboardInterrupt:
+            _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}")
+            raise typer.Exit(INTERRUPTED) from None
+        _present(rows, folder)
+    statuses = set(rows["status"])
+    if statuses == {"absent"}:
+        raise typer.Exit(BAD_INPUT)
+    if statuses - {"done", "absent"}:
+        raise typer.Exit(SOME_FAILED)
+
+
+def _present(rows: pd.DataFrame, folder: Path) -> None:
+    """Write the figures and table.csv, and print the table."""
+    from .figures import draw_figures
+    from .table import print_table, write_table
+
+    write_table(rows, folder / "table.csv")
+    figures = draw_figures(rows, folder)
+    _say(f"{folder}: runs.sqlite, table.csv, {len(figures)} figures")
+    print_table(rows)
+
+
+@app.command("list")
+def list_(what: Listing) -> None:
+    """Print the known estimators (with their options), logs, shipped experiments, or scores."""
+    with refusing_bad_input():
+        for name, about in _LISTS[what]().items():
+            typer.echo(f"{name}: {about}" if about else name)
+
+
+def _estimators() -> dict[str, str]:
+    from ..estimators.registry import known_estimators
+
+    return {
+        name: ", ".join(getattr(kind, "__dataclass_fields__", ())) for name, kind in sorted(known_estimators().items())
+    }
+
+
+def _logs() -> dict[str, str]:
+    from ..datasets.mission import MISSIONS
+    from ..datasets.opening import catalog_names
+
+    return dict.fromkeys(catalog_names(), "recorded") | dict.fromkeys(MISSIONS, "mission, simulated")
+
+
+def _experiments() -> dict[str, str]:
+    import yaml
+
+    from .experiment import shipped_experiments
+
+    return {name: yaml.safe_load(path.read_text())["description"] for name, path in shipped_experiments().items()}
+
+
+def _scores() -> dict[str, str]:
+    from .run import COSTS, SCORES
+
+    return SCORES | COSTS
+
+
+_LISTS = {
+    Listing.estimators: _estimators,
+    Listing.logs: _logs,
+    Listing.experiments: _experiments,
+    Listing.scores: _scores,
+}
+
+
+@app.command()
+def simulate(
+    scenario: Annotated[str, typer.Argument(help="A YAML file of a scenario's keys, or a mission's name.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The folder to write; it must not hold a log already.")],
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+) -> None:
+    """Simulate SCENARIO and write the log as a folder that `fathom` and anybody else can read."""
+    with refusing_bad_input():
+        from ..datasets import simulator
+        from ..datasets.folder import write_folder
+
+        log = simulator.simulate(_scenario(scenario), seed)
+        write_folder(log, out)
+        typer.echo(f"{out}: {log.name}, {log.duration_s:.0f} s, imu, {', '.join(log.streams)}, truth")
+
+
+def _scenario(text: str) -> Scenario:
+    import yaml
+
+    from ..datasets.errors import DatasetError
+    from ..datasets.scenario import Scenario
+
+    if not text.endswith((".yaml", ".yml")):
+        return Scenario.from_dict({"mission": text})
+    try:
+        content = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise DatasetError(f"{text}: not readable as YAML: {' '.join(str(error).split())}") from None
+    return Scenario.from_dict(content, text)
+
+
+@app.command()
+def score(
+    truth: Annotated[Path, typer.Argument(help="TUM file: t x y z qx qy qz qw.")],
+    estimate: Annotated[Path, typer.Argument(help="TUM file.")],
+    align: Annotated[Align, typer.Option(help="What the estimate is forgiven.")] = Align.none,
+    tolerance_s: Annotated[float, typer.Option(min=0, help="How far apart in time two poses may be.")] = 0.01,
+    delta: Annotated[float, typer.Option(help="Step of the RPE.")] = 1.0,
+    unit: Annotated[str, typer.Option(help="frames, s or m.")] = "m",
+    pairs: Annotated[str, typer.Option(help="consecutive or all.")] = "all",
+) -> None:
+    """Print ATE and RPE of ESTIMATE against TRUTH."""
+    with refusing_bad_input():
+        from rich.console import Console
+        from rich.table import Table
+
+        from ..datasets.trajectory import Trajectory
+        from .metrics import ate, rpe
+
+        true, estimated = Trajectory.from_tum(truth), Trajectory.from_tum(estimate)
+        tolerance_ns = round(tolerance_s * 1e9)
+        absolute = ate(true, estimated, align.value, tolerance_ns)
+        relative = rpe(true, estimated, delta, unit, pairs, tolerance_ns)  # pyright: ignore[reportArgumentType]
+        table = Table("", "rmse", "mean", "median", "std", "min", "max", "over")
+        what = (
+            (absolute, "{}_m", "ATE, m", f"{absolute.n} poses"),
+            (absolute, "rotation_{}_deg", "ATE, °", f"{absolute.n} poses"),
+            (relative, "{}_m", "RPE, m", f"{relative.n} pairs"),
+            (relative, "rotation_{}_deg", "RPE, °", f"{relative.n} pairs"),
+        )
+        for numbers, name, title, over in what:
+            values = [getattr(numbers, name.format(key)) for key in ("rmse", "mean", "median", "std", "min", "max")]
+            table.add_row(title, *("–" if value is None else f"{value:.6f}" for value in values), over)
+        Console().print(table)
+        over = f"RPE over {delta:g} {unit}, {pairs} pairs"
+        typer.echo(f"alignment: {absolute.alignment}; {over}; matched within {tolerance_s:g} s")
+
+
+@contextmanager
+def refusing_bad_input() -> Iterator[None]:
+    """Turn what a user can mend into one line on stderr and exit status 2; our own bugs keep their traceback."""
+    try:
+        yield
+    except ValueError as error:
+        from ..datasets.errors import DatasetError
+        from ..estimators.registry import EstimatorError
+        from .association import ScoreError
+        from .experiment import ExperimentError
+
+        if not isinstance(error, DatasetError | EstimatorError | ExperimentError | ScoreError):
+            raise
+        _say(f"fathom: {' '.join(str(error).split())}")
+        raise typer.Exit(BAD_INPUT) from None
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr)
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,272 @@
+"""An experiment: which estimators on which logs, from which seeds, scored how; one YAML file."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import yaml
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+from ..datasets.errors import nearest
+from ..datasets.log import Log
+from ..datasets.scenario import Scenario
+from ..estimators.interface import Estimator
+from ..estimators.registry import create
+from .metrics import Alignment, Dims
+from .run import Scoring
+
+STRICT = ConfigDict(extra="forbid", populate_by_name=True)
+SHIPPED = Path(__file__).parent / "experiments"
+
+
+class ExperimentError(ValueError):
+    """An experiment file cannot be used; says which file, which key, and what to write instead."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class LogSpec:
+    """One log of an experiment: simulated from a `scenario`, or recorded, by catalog name or folder (`log`).
+
+    Attributes:
+        scenario: keys of a `Scenario`; simulated once per seed.
+        log: a name that `fathom list logs` prints, or a folder with a log.yaml.
+        name: what tables call it; made from the mission and the IMU, or from the folder, when left out.
+        align, dims: override the experiment's scores for this log.
+    """
+
+    scenario: dict[str, Any] | None = None
+    log: str | None = None
+    name: str = ""
+    align: Alignment | None = None
+    dims: Dims | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> LogSpec:
+        if (self.scenario is None) == (self.log is None):
+            raise ValueError("a log needs either `scenario` or `log`, and not both")
+        if self.scenario is not None:
+            Scenario.from_dict(self.scenario)
+        if not self.name:
+            object.__setattr__(self, "name", self._default_name())
+        return self
+
+    def _default_name(self) -> str:
+        if self.log is not None:
+            return Path(self.log).name
+        scenario = Scenario.from_dict(self.scenario or {})
+        return f"{scenario.mission}-{scenario.imu}" if isinstance(scenario.imu, str) else scenario.mission
+
+    @property
+    def duration_s(self) -> float | None:
+        """How long a simulated log is; None for a recorded one, which must be opened to know."""
+        return None if self.scenario is None else Scenario.from_dict(self.scenario).duration_s
+
+    def open(self, seed: int | None, data: Path | None = None, repair: bool = False) -> Log:
+        """Simulate the log from this seed, or read it.
+
+        Raises:
+            DatasetError: it cannot be read; RecordingNotFound where it is not on this machine.
+        """
+        if self.scenario is not None:
+            from ..datasets.simulator import simulate
+
+            assert seed is not None
+            return simulate(Scenario.from_dict(self.scenario), seed)
+        from ..datasets.opening import open_log
+
+        assert self.log is not None
+        return open_log(self.log, data=data, repair=repair)
+
+
+@dataclass(frozen=True, config=STRICT)
+class EstimatorSpec:
+    """One estimator of an experiment.
+
+    Attributes:
+        name: as in `fathom list estimators`.
+        label: what tables call it; the name, when left out. No two may be the same.
+        options: written `with:`; the options that differ from the estimator's defaults.
+    """
+
+    name: str
+    label: str = ""
+    options: dict[str, Any] = Field(default_factory=dict, alias="with")
+
+    @model_validator(mode="after")
+    def _known(self) -> EstimatorSpec:
+        self.create()
+        if not self.label:
+            object.__setattr__(self, "label", self.name)
+        return self
+
+    def create(self) -> Estimator:
+        """Return the configured estimator.
+
+        Raises:
+            EstimatorError: unknown name or option.
+        """
+        return create(self.name, **self.options)
+
+
+class Run(NamedTuple):
+    """One estimator on one log; seed is None for a recorded log."""
+
+    log: LogSpec
+    estimator: EstimatorSpec
+    seed: int | None
+
+    def __str__(self) -> str:
+        seed = "" if self.seed is None else f" seed {self.seed}"
+        return f"{self.log.name} / {self.estimator.label}{seed}"
+
+
+@dataclass(frozen=True, config=STRICT)
+class Experiment:
+    """Every estimator on every log; simulated logs once per seed, recorded logs once.
+
+    Attributes:
+        name: its folder under `results`.
+        description: what it asks, in a sentence or two.
+        logs, estimators: at least one each.
+        seeds: of the simulated logs; all estimators share a seed's log, so their differences are paired.
+        scores: how runs are scored; a log may override `align` and `dims`.
+        max_gap_s: longest gap in the IMU that is bridged.
+        timeout_s: longest time for one run.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    logs: Annotated[tuple[LogSpec, ...], Field(min_length=1)]
+    estimators: Annotated[tuple[EstimatorSpec, ...], Field(min_length=1)]
+    description: str = ""
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (1,)
+    scores: Scoring = Scoring()
+    max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
+    timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0
+
+    @model_validator(mode="after")
+    def _no_duplicates(self) -> Experiment:
+        _refuse_twice("label", (estimator.label for estimator in self.estimators))
+        _refuse_twice("log name", (log.name for log in self.logs))
+        _refuse_twice("seed", self.seeds)
+        return self
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], source: str = "experiment") -> Experiment:
+        """Check what a YAML file holds; `source` names the file in errors.
+
+        Raises:
+            ExperimentError: unknown or missing key, unknown estimator, option or mission, a value that does not fit.
+        """
+        try:
+            return TypeAdapter(cls).validate_python(content)
+        except ValidationError as error:
+            raise ExperimentError(f"{source}: {'; '.join(map(_explain, error.errors()))}") from None
+
+    @classmethod
+    def load(cls, name_or_path: str | Path) -> Experiment:
+        """Read a shipped experiment by its name, or anybody's by the path of its YAML file.
+
+        Raises:
+            ExperimentError: no such file, not YAML, or as in `from_dict`.
+        """
+        path = find_experiment(name_or_path)
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+            raise ExperimentError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from None
+        if not isinstance(content, dict):
+            raise ExperimentError(f"{path}: expected keys such as `name`, `logs`, `estimators`, found {content!r:.60}")
+        return cls.from_dict({"name": path.stem} | content, str(path))
+
+    def runs(self) -> list[Run]:
+        """Return every run, log by log, seed by seed, so that runs on one log are neighbours."""
+        return [
+            Run(log, estimator, seed)
+            for log in self.logs
+            for seed in (self.seeds if log.scenario is not None else (None,))
+            for estimator in self.estimators
+        ]
+
+    def scoring(self, log: LogSpec) -> Scoring:
+        """Return how runs on this log are scored."""
+        return replace(self.scores, align=log.align or self.scores.align, dims=log.dims or self.scores.dims)
+
+    def spec(self, run: Run) -> dict[str, Any]:
+        """Return all that decides a run's numbers, as JSON can hold it: defaults included."""
+        source = run.log.log or plain(Scenario.from_dict(run.log.scenario or {}))
+        return {
+            "log": source,
+            "estimator": {"name": run.estimator.name, "config": plain(run.estimator.create())},
+            "seed": run.seed,
+            "scores": plain(self.scoring(run.log)),
+            "max_gap_s": self.max_gap_s,
+            "timeout_s": self.timeout_s,
+        }
+
+
+def shipped_experiments() -> dict[str, Path]:
+    """Return the experiments that come with Fathom, by name."""
+    return {path.stem: path for path in sorted(SHIPPED.glob("*.yaml"))}
+
+
+def find_experiment(name_or_path: str | Path) -> Path:
+    """Return the YAML file of a shipped experiment, or the path as it stands.
+
+    Raises:
+        ExperimentError: neither a shipped name nor a file.
+    """
+    shipped, name = shipped_experiments(), str(name_or_path)
+    path = shipped.get(name) or shipped.get(name.replace("-", "_")) or Path(name_or_path)
+    if not path.is_file():
+        raise ExperimentError(
+            f"{name}: no such experiment or file{nearest(name, shipped)} (shipped: {', '.join(shipped)})"
+        )
+    return path
+
+
+def plain(value: Any) -> Any:
+    """Return a configuration as dicts, sorted lists and numbers, the same on every machine."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, set | frozenset):
+        return sorted(plain(item) for item in value)
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _refuse_twice(what: str, values: Iterable[Any]) -> None:
+    twice = [value for value, n in Counter(values).items() if n > 1]
+    if twice:
+        hint = {"label": "; give each its own `label`", "log name": "; give each its own `name`"}.get(what, "")
+        raise ValueError(f"the {what} {twice[0]!r} is there twice{hint}")
+
+
+def _explain(error: Any) -> str:
+    """Put one of pydantic's errors into our words."""
+    *parents, key = error["loc"] or ("",)
+    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
+    if error["type"] == "unexpected_keyword_argument":
+        known = _known_keys(parents)
+        return f"{place}: unknown key {key!r}{nearest(str(key), known)} (known: {', '.join(known)})"
+    if error["type"] == "missing":
+        return f"{place}: this key is missing"
+    message = error["msg"].removeprefix("Value error, ")
+    found = "" if error["type"] == "value_error" else f", found {error['input']!r:.60}"
+    return f"{place}: {message}{found}" if place else message
+
+
+def _known_keys(parents: list[Any]) -> list[str]:
+    """Return the keys allowed under this place of the file."""
+    kind = {"logs": LogSpec, "estimators": EstimatorSpec, "scores": Scoring}.get(
+        parents[0] if parents else "", Experiment
+    )
+    return ["with" if field.name == "options" else field.name for field in dataclasses.fields(kind)]

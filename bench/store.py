@@ -1,0 +1,178 @@
+"""What runs leave behind: one SQLite file per experiment, one transaction per finished run."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sqlite3
+import subprocess
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from .experiment import ExperimentError
+from .run import COSTS, SCORES
+
+Row = Mapping[str, Any]
+
+IDENTITY = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER", "output": "TEXT"}
+"""What tells rows apart: seed is NULL for a recorded log; output is "online" or "hindsight"."""
+
+OUTCOME = {
+    "status": "TEXT",  # done, diverged, failed, absent
+    "cause": "TEXT",
+    "failed_at_s": "REAL",
+    "lookahead_s": "REAL",
+    "truth_kind": "TEXT",
+    "align": "TEXT",
+    "dims": "TEXT",
+    "duration_s": "REAL",
+}
+ORIGIN = {
+    "estimator": "TEXT",
+    "spec": "TEXT",  # JSON
+    "counts": "TEXT",  # JSON
+    "notes": "TEXT",  # JSON
+    "trajectory": "TEXT",  # file under trajectories/
+    "truth_trajectory": "TEXT",  # likewise, at the same times
+    "started": "TEXT",
+    "finished": "TEXT",
+    "commit_id": "TEXT",
+    "versions": "TEXT",  # JSON
+    "machine": "TEXT",  # JSON
+}
+COLUMNS = IDENTITY | OUTCOME | dict.fromkeys([*SCORES, *COSTS], "REAL") | ORIGIN
+SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"
+
+
+class Store:
+    """The rows of one experiment; a file made by an older version gains the columns it lacks.
+
+    Raises:
+        ExperimentError: the file is there and is not such a store.
+    """
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self.connection = sqlite3.connect(path, timeout=60)
+        try:
+            self._prepare()
+        except sqlite3.Error as error:
+            self.connection.close()
+            raise ExperimentError(
+                f"{path}: not a store of runs ({error}); move it away, or give another --out"
+            ) from None
+
+    def _prepare(self) -> None:
+        run = self.connection.execute
+        run("PRAGMA journal_mode = WAL")
+        run("PRAGMA synchronous = FULL")
+        with self.connection:
+            run(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())})")
+            there = {row[1] for row in run("PRAGMA table_info(runs)")}
+            for name in COLUMNS.keys() - there:
+                run(f"ALTER TABLE runs ADD COLUMN {name} {COLUMNS[name]}")
+            run("CREATE UNIQUE INDEX IF NOT EXISTS one_row ON runs (experiment, log, label, ifnull(seed, -1), output)")
+
+    def write(self, rows: Sequence[Row]) -> None:
+        """Put the rows of one run in place of what an earlier run of the same name left, all or nothing.
+
+        Raises:
+            ExperimentError: the disk is full, or the file cannot be written.
+        """
+        try:
+            with self.connection:
+                for row in rows:
+                    self.connection.execute(f"DELETE FROM runs WHERE {SAME_RUN}", {key: row[key] for key in IDENTITY})
+                for row in rows:
+                    names = ", ".join(row)
+                    values = ", ".join(f":{name}" for name in row)
+                    self.connection.execute(f"INSERT INTO runs ({names}) VALUES ({values})", dict(row))
+        except sqlite3.OperationalError as error:
+            raise ExperimentError(f"{self.path}: cannot write ({error}); the runs before are kept") from None
+
+    def read(self) -> pd.DataFrame:
+        """Return every row, in the order in which they were written."""
+        return read_rows(self.connection)
+
+    def close(self) -> None:
+        """Fold the write-ahead log into the file and let go of it."""
+        self.connection.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def read_rows(connection: sqlite3.Connection) -> pd.DataFrame:
+    """Return the rows of an open store."""
+    cursor = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM runs ORDER BY rowid")
+    table = pd.DataFrame(cursor.fetchall(), columns=list(COLUMNS))
+    numbers = [name for name, kind in COLUMNS.items() if kind == "REAL"]
+    return table.astype(dict.fromkeys(numbers, "float64") | {"seed": "Int64"})
+
+
+def load_runs(folder: Path | str) -> pd.DataFrame:
+    """Return the rows of the experiment in `folder`, read only.
+
+    Raises:
+        ExperimentError: no store there.
+    """
+    path = Path(folder) / "runs.sqlite"
+    if not path.is_file():
+        raise ExperimentError(f"{path}: no such file; `fathom run` makes it")
+    with closing(sqlite3.connect(path)) as connection:
+        return read_rows(connection)
+
+
+@cache
+def provenance() -> dict[str, str]:
+    """Return commit, versions and machine of this process, as a row holds them."""
+    machine = {
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "platform": platform.platform(),
+        "node": platform.node(),
+    }
+    return {"commit_id": _commit(), "versions": json.dumps(_versions()), "machine": json.dumps(machine)}
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for package in ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "absent"
+    return found
+
+
+def _commit() -> str:
+    """Return the commit of the checkout this file belongs to ("-dirty" where edited), else the package's version."""
+    here = Path(__file__)
+    git = ["git", "-C", str(here.parent)]
+    try:
+        subprocess.run([*git, "ls-files", "--error-unmatch", here.name], capture_output=True, check=True, timeout=20)
+        describe = [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+        return subprocess.run(describe, capture_output=True, check=True, text=True, timeout=20).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return f"fathom-bench {_versions()['fathom-bench']}"
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next(
+        (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor()
+    )

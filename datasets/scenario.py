@@ -1,0 +1,277 @@
+"""What to simulate: a scenario is frozen, validated and printable, and with a seed it determines a log."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import ConfigDict, Discriminator, Field, Tag, ValidationError, field_validator, model_validator
+from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import Rotation
+
+from .errors import DatasetError, nearest
+from .mission import MISSIONS
+from .rig import ImuNoise, Mounting, Rig
+
+DEGREE = math.pi / 180
+DEGREE_PER_HOUR = DEGREE / 3600
+DEGREE_PER_ROOT_HOUR = DEGREE / 60
+MILLI_G = 9.81e-3
+
+WALK_HORIZON_S = 1000.0
+"""Data sheets give an in-run bias stability B, and no walk. Ours is the random walk whose Allan deviation, K √(τ/3),
+has reached B at this τ."""
+
+
+def from_data_sheet(
+    gyro_density: float,
+    accel_density: float,
+    gyro_in_run: float,
+    accel_in_run: float,
+    gyro_bias: float,
+    accel_bias: float,
+) -> ImuNoise:
+    """Return the noise of an IMU from its data sheet, in SI units: densities, in-run stabilities, turn-on biases."""
+    walk = math.sqrt(3 / WALK_HORIZON_S)
+    return ImuNoise(gyro_density, accel_density, walk * gyro_in_run, walk * accel_in_run, gyro_bias, accel_bias)
+
+
+IMU_GRADES = {
+    # Xsens MTi-1 data sheet: 0.007 °/s/√Hz, 120 µg/√Hz, in-run 10 °/h and 0.03 mg. Turn-on: its maker's support page
+    # gives the gyro ±0.5 °/s within a year, of which a tenth is assumed left after a calibration at rest; 3 mg assumed.
+    "consumer": from_data_sheet(
+        0.007 * DEGREE, 0.120 * MILLI_G, 10 * DEGREE_PER_HOUR, 0.03 * MILLI_G, 0.05 * DEGREE, 3 * MILLI_G
+    ),
+    # SBG Ellipse-N data sheet: 0.18 °/√h, 57 µg/√Hz, in-run 7 °/h and 14 µg. Turn-on: 0.01 °/s and 1 mg assumed.
+    "industrial": from_data_sheet(
+        0.18 * DEGREE_PER_ROOT_HOUR, 0.057 * MILLI_G, 7 * DEGREE_PER_HOUR, 0.014 * MILLI_G, 0.01 * DEGREE, 1 * MILLI_G
+    ),
+    # Sensonor STIM300 data sheet (TS1524): 0.15 °/√h, 0.06 m/s/√h, in-run 0.5 °/h and 0.05 mg; turn-on: gyro from its
+    # 10 °/h rms over temperature gradients, accel 0.75 mg.
+    "tactical": from_data_sheet(
+        0.15 * DEGREE_PER_ROOT_HOUR,
+        0.06 / 60,
+        0.5 * DEGREE_PER_HOUR,
+        0.05 * MILLI_G,
+        10 * DEGREE_PER_HOUR,
+        0.75 * MILLI_G,
+    ),
+    # Honeywell HG9900 brochure (N61-1638): 0.002 °/√h, bias 0.0035 °/h and 25 µg, 1 σ. It states no accelerometer noise
+    # and no in-run figures: assumed are 2.2 µg/√Hz (7 µg rms in 0–10 Hz, usual for its quartz accelerometers), and a
+    # tenth of the bias in run.
+    "navigation": from_data_sheet(
+        0.002 * DEGREE_PER_ROOT_HOUR,
+        2.2e-3 * MILLI_G,
+        0.00035 * DEGREE_PER_HOUR,
+        2.5e-3 * MILLI_G,
+        0.0035 * DEGREE_PER_HOUR,
+        0.025 * MILLI_G,
+    ),
+}
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+
+Imu = Annotated[
+    Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
+    Discriminator(lambda imu: "grade" if isinstance(imu, str) else "figures"),
+]
+
+STRICT = ConfigDict(extra="forbid")
+
+
+@dataclass(frozen=True, config=STRICT)
+class MountingSpec:
+    """Where a sensor S sits: R_BS = Rz(yaw) Ry(pitch) Rx(roll), and its lever arm in B."""
+
+    roll_pitch_yaw_deg: Vector = (0.0, 0.0, 0.0)
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+
+    def mounting(self) -> Mounting:
+        """Return it as the rig knows it."""
+        R_BS = Rotation.from_euler("xyz", self.roll_pitch_yaw_deg, degrees=True).as_matrix()
+        return Mounting(R_BS, np.array(self.lever_arm_m))
+
+
+@dataclass(frozen=True, config=STRICT)
+class DvlSpec:
+    """Four-beam Janus DVL at B. 5 mm/s per beam: Nortek DVL1000, RDI WHN600; 22.5°: Water Linked A50."""
+
+    rate_hz: Positive = 5.0
+    beam_sigma_mps: Positive = 0.005
+    beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
+    delay_s: NotNegative = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class DepthSpec:
+    """Pressure sensor. The Bar30 resolves 2 mm; sigma covers swell and air pressure as well."""
+
+    rate_hz: Positive = 10.0
+    sigma_m: Positive = 0.02
+    delay_s: NotNegative = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class GpsSpec:
+    """GPS, heard only while the antenna is out of the water. 1–5 m is what receivers give without corrections."""
+
+    rate_hz: Positive = 1.0
+    horizontal_sigma_m: Positive = 1.5
+    vertical_sigma_m: Positive = 3.0
+    delay_s: NotNegative = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class HeadingSpec:
+    """Magnetic heading, 1–2° after calibration; the bias is a dial that no estimator is told of."""
+
+    rate_hz: Positive = 5.0
+    sigma_deg: Positive = 1.0
+    bias_deg: Finite = 0.0
+    delay_s: NotNegative = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class PriorSpec:
+    """Standard deviations of the belief at the start; those of the biases are the IMU's at turn-on."""
+
+    attitude_deg: Positive = 0.5  # each of the three axes of B
+    position_m: Positive = 1.0
+    velocity_mps: Positive = 0.05
+
+
+@dataclass(frozen=True, config=STRICT)
+class Scenario:
+    """A mission, a vehicle and its sensors.
+
+    The vehicle starts afloat, surfaces every `surface_every_s` or so, and ends afloat. Depths count from where it
+    floats, down positive; courses from east, counter-clockwise. A sensor that is None is not aboard.
+    """
+
+    mission: str = "lawnmower"
+    duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
+    imu: Imu = "tactical"  # a name in IMU_GRADES, or figures of one's own
+
+    # the path
+    speed_mps: Positive = 1.5
+    depth_m: Positive = 20.0  # where the lawnmower runs, and the yo-yo turns upwards
+    shallow_m: NotNegative = 5.0  # where the yo-yo turns downwards
+    climb_deg: Annotated[float, Field(gt=0, le=45)] = 20.0  # of every climb and dive
+    leg_m: Positive = 100.0
+    turn_radius_m: Positive = 10.0
+    course_deg: Finite = 30.0  # of the first leg
+    surface_every_s: Positive = 270.0
+    surface_for_s: Positive = 36.0  # half of it at the start and at the end
+    wobble_deg: Annotated[float, Field(ge=0, le=10)] = 1.5  # of roll, pitch and yaw, about the path's own
+
+    # the vehicle
+    gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
+    imu_mounting: MountingSpec = MountingSpec((180.0, 2.0, 87.0), (-0.35, 0.05, 0.12))
+    depth_mounting: MountingSpec = MountingSpec((0.0, 0.0, 0.0), (0.40, -0.06, 0.05))
+    gps_mounting: MountingSpec = MountingSpec((0.0, 0.0, 0.0), (-0.25, 0.0, 0.30))
+    heading_mounting: MountingSpec = MountingSpec((1.5, -2.0, 4.0), (0.55, 0.0, 0.05))
+
+    # the sensors
+    imu_rate_hz: Positive = 100.0
+    dvl: DvlSpec | None = DvlSpec()
+    depth: DepthSpec | None = DepthSpec()
+    gps: GpsSpec | None = GpsSpec()
+    heading: HeadingSpec | None = HeadingSpec()
+    prior: PriorSpec = PriorSpec()
+    noise_scale: NotNegative = 1.0  # of every random error, the prior's too; what is stated stays. 0: none
+    start_ns: Annotated[int, Field(ge=0, le=4_000_000_000_000_000_000)] = 0
+
+    @field_validator("mission")
+    @classmethod
+    def _known_mission(cls, name: str) -> str:
+        if name not in MISSIONS:
+            raise ValueError(f"no mission {name!r}{nearest(name, MISSIONS)}; known: {', '.join(MISSIONS)}")
+        return name
+
+    @field_validator("imu")
+    @classmethod
+    def _known_grade(cls, imu: str | ImuNoise) -> str | ImuNoise:
+        if isinstance(imu, str) and imu not in IMU_GRADES:
+            raise ValueError(f"no IMU grade {imu!r}{nearest(imu, IMU_GRADES)}; known: {', '.join(IMU_GRADES)}")
+        if isinstance(imu, ImuNoise):
+            for name, value in dataclasses.asdict(imu).items():
+                if not (math.isfinite(value) and (value > 0 or (value == 0 and name.endswith("walk")))):
+                    raise ValueError(f"{name} must be positive and finite, found {value}")
+        return imu
+
+    @model_validator(mode="after")
+    def _saw_has_teeth(self) -> Scenario:
+        if MISSIONS[self.mission].sawtooth and self.shallow_m >= self.depth_m:
+            raise ValueError(f"{self.mission}: shallow_m {self.shallow_m} must be less than depth_m {self.depth_m}")
+        return self
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], source: str = "scenario") -> Scenario:
+        """Build a scenario from what a file says.
+
+        Raises:
+            DatasetError: naming source, key, what is wrong, and for an unknown key its nearest known neighbour.
+        """
+        if not isinstance(values, Mapping):
+            raise DatasetError(f"{source}: expected a mapping of keys, found {values!r}")
+        try:
+            return cls(**{str(key): value for key, value in values.items()})
+        except ValidationError as error:
+            errors = error.errors()  # a misspelt key is also a missing one: tell of the spelling
+            first = min(errors, key=lambda e: e["type"] != "unexpected_keyword_argument")
+            path = [str(part) for part in first["loc"] if part not in ("grade", "figures")]
+            where = ": ".join([source, ".".join(path)] if path else [source])
+            if first["type"] == "unexpected_keyword_argument":
+                known = _fields_at(path[:-1])
+                raise DatasetError(
+                    f"{where}: unknown key{nearest(path[-1], known)}; known: {', '.join(known)}"
+                ) from None
+            what = first["msg"].removeprefix("Value error, ")
+            found = "" if first["type"] == "value_error" else f", found {first['input']!r}"
+            raise DatasetError(f"{where}: {what}{found}") from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Inverse of `from_dict`: plain values, ready for YAML."""
+        return dataclasses.asdict(self)
+
+    @property
+    def imu_noise(self) -> ImuNoise:
+        """The figures behind `imu`."""
+        return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
+
+    @property
+    def rig(self) -> Rig:
+        """What the estimators are told of the vehicle."""
+        return Rig(
+            imu_noise=self.imu_noise,
+            imu=self.imu_mounting.mounting(),
+            depth=self.depth_mounting.mounting(),
+            gps=self.gps_mounting.mounting(),
+            heading=self.heading_mounting.mounting(),
+            gravity=self.gravity_mps2,
+        )
+
+
+NESTED = {
+    "dvl": DvlSpec,
+    "depth": DepthSpec,
+    "gps": GpsSpec,
+    "heading": HeadingSpec,
+    "prior": PriorSpec,
+    "imu": ImuNoise,
+    "imu_mounting": MountingSpec,
+    "depth_mounting": MountingSpec,
+    "gps_mounting": MountingSpec,
+    "heading_mounting": MountingSpec,
+}
+
+
+def _fields_at(path: list[str]) -> list[str]:
+    """Return the keys known below a key of the scenario, or at its top."""
+    return [field.name for field in dataclasses.fields(NESTED[path[0]] if path else Scenario)]

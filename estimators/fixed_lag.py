@@ -1,0 +1,358 @@
+"""The fixed-lag smoother on GTSAM's IncrementalFixedLagSmoother: keyframes, factors, and two trajectories.
+
+One keyframe holds pose, velocity and biases; neighbours are tied by the IMU. A reading between keyframes is tied to the
+keyframe before it, carried there by the IMU. The pass gives what it believes now, and of each state what it believes
+when that state leaves the window.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import field
+from typing import Any, Literal
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from ..datasets.epochs import DVL, IMU_SAMPLE, Epoch
+from ..datasets.rig import Rig
+from ..datasets.state import Array, Belief, NavState
+from ..datasets.trajectory import Trajectory
+from .dvl_preintegration import preintegrate_dvl
+from .gtsam_border import (
+    carried_factor,
+    displacement_factor,
+    estimated_belief,
+    estimated_state,
+    explain,
+    insert_state,
+    preintegrate_imu,
+    prior_factor,
+    reading_factor,
+)
+from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
+from .interface import FACTORS, Diverged
+from .records import as_belief, as_record, split, with_rate_noise
+
+DvlFactor = Literal["velocity", "preintegrated-loose"]
+
+
+@dataclass(frozen=True)
+class FixedLagSmoother:
+    """MAP over the last lag_s seconds; older states are marginalised out.
+
+    A DVL reading makes a keyframe, or with keyframe_period_s the first one after that long. Where the DVL is silent for
+    keyframe_timeout_s, the next other reading makes one.
+
+    Attributes:
+        lag_s: length of the window.
+        dvl: how DVL readings enter. "velocity": each by its own factor (eq. 4). "preintegrated-loose": summed to a
+            displacement from keyframe to keyframe (eq. 6). With both, the reading at a keyframe goes by its velocity
+            and the others are summed, so that none is used twice.
+        dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
+            straight.
+        keyframe_period_s: None for every DVL reading (1 s with a preintegrated factor).
+        keyframe_timeout_s: see above.
+        max_hold_s: an interval with a longer silence of the DVL is not preintegrated; its readings go by velocity.
+        merge_ns: a reading this close to a keyframe is taken as of it, and counted.
+        factors: the sensors it may use.
+        inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
+        factorization: iSAM2's; Cholesky fails on the IMU noise of a tactical grade.
+        relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
+            linearises a variable anew. Position enters every factor linearly but for its rotation into B.
+        hindsight_covariance_s: period at which states that leave the window keep their covariance.
+    """
+
+    lag_s: float = Field(default=3.0, gt=0)
+    dvl: frozenset[DvlFactor] = frozenset({"velocity"})
+    dvl_between: Literal["held", "straight"] = "held"
+    keyframe_period_s: float | None = Field(default=None, gt=0)
+    keyframe_timeout_s: float = Field(default=0.5, gt=0)
+    max_hold_s: float = Field(default=1.5, gt=0)
+    merge_ns: int = Field(default=5_000_000, ge=0)
+    factors: frozenset[str] = FACTORS
+    inflate: dict[str, float] = Field(default_factory=dict)
+    factorization: Literal["QR", "CHOLESKY"] = "QR"
+    relinearize: tuple[float, float, float, float] = (0.005, 1e3, 0.05, 1.0)
+    hindsight_covariance_s: float = Field(default=5.0, gt=0)
+
+    @property
+    def preintegrates(self) -> bool:
+        """Whether DVL readings are summed between keyframes."""
+        return "preintegrated-loose" in self.dvl
+
+    @property
+    def period_s(self) -> float:
+        """Time between keyframes; 0 for one at every DVL reading."""
+        return self.keyframe_period_s or (1.0 if self.preintegrates else 0.0)
+
+    def begin(self, prior: Belief, rig: Rig) -> FixedLagPass:
+        """See `Estimator.begin`."""
+        return FixedLagPass(self, prior, rig)
+
+
+@plain_dataclass
+class Keyframe:
+    """A state of the graph, and the motion since: what later readings and ticks are carried by.
+
+    Attributes:
+        index: of its variables.
+        t_ns: its time.
+        before: the IMU sample that ends at it.
+        imu: samples from it to the next keyframe.
+        next_ns: time of the next keyframe, if there is one.
+        dvl: DVL readings from it to the next keyframe, in order.
+    """
+
+    index: int
+    t_ns: int
+    before: NDArray[Any] | None
+    imu: NDArray[Any]
+    next_ns: int | None = None
+    dvl: list[NDArray[Any]] = field(default_factory=list)
+
+
+class FixedLagPass:
+    """One pass of `FixedLagSmoother`."""
+
+    def __init__(self, config: FixedLagSmoother, prior: Belief, rig: Rig) -> None:
+        self.counts: Counter[str] = Counter()
+        self._config = config
+        self._rig = compile_rig(rig, config.factors, config.inflate)
+        self._R_BI = rig.imu.R_BS
+        self._inflate: list[float] = self._rig["inflate"][0].tolist()
+        self._start_ns = self._now_ns = self._dvl_heard_ns = prior.t_ns
+        self._smoother = _smoother(config)
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._state = prior.state
+        self._belief: Belief | None = prior
+        self._pending: list[NDArray[Any]] = []  # readings after the last keyframe
+        self._ticks: deque[int] = deque()
+        self._hindsight: list[Belief] = []
+        self._covariance_due_ns = prior.t_ns
+        self._window: deque[Keyframe] = deque([Keyframe(0, prior.t_ns, None, np.zeros(0, IMU_SAMPLE))])
+        self._graph.add(prior_factor(as_record(prior), self._rig))
+        values = gtsam.Values()
+        insert_state(values, 0, prior.state, self._R_BI)
+        self._update(values, self._window[0])
+
+    # --- the interface -----------------------------------------------------------------------------------------------
+
+    def step(self, epoch: Epoch) -> None:
+        """See `Pass.step`."""
+        newest = self._window[-1]
+        if newest.before is None:
+            newest.before = first_sample(epoch.imu, self._rig)
+        newest.imu = np.concatenate([newest.imu, epoch.imu]) if len(newest.imu) else epoch.imu
+        self._now_ns = epoch.t_ns
+        if epoch.tick:
+            self._ticks.append(epoch.t_ns)
+        if len(epoch.readings):
+            self._receive(epoch.readings)
+
+    def belief(self) -> Belief:
+        """See `Pass.belief`."""
+        newest = self._window[-1]
+        if self._belief is None:
+            self._belief = estimated_belief(self._smoother, newest.index, newest.t_ns, self._R_BI)
+        return with_rate_noise(self._carry(newest, self._belief, self._now_ns), self._rig)
+
+    def finish(self) -> Trajectory | None:
+        """See `Pass.finish`. States still in the window have seen less than the lag: all that there was."""
+        self._leave(list(self._window))
+        return Trajectory.from_beliefs(self._hindsight, self._config.lag_s) if self._hindsight else None
+
+    # --- keyframes ---------------------------------------------------------------------------------------------------
+
+    def _receive(self, readings: NDArray[Any]) -> None:
+        """Put every reading of an epoch where it belongs, and make the keyframes that they call for."""
+        new = []
+        for k in np.argsort(readings["t_ns"], kind="stable").tolist():
+            reading = readings[k : k + 1]
+            kind, t_ns = int(reading["kind"][0]), int(reading["t_ns"][0])
+            if np.isinf(self._inflate[kind]):
+                continue
+            if t_ns < self._window[-1].t_ns - self._config.merge_ns:
+                self._receive_late(reading, t_ns)
+            else:
+                self._pending.append(reading)
+                new.append((kind, t_ns))
+        for kind, t_ns in new:
+            if self._calls_for_keyframe(kind, t_ns):
+                self._make_keyframe(t_ns)
+        if any(kind == DVL for kind, _ in new):
+            self._dvl_heard_ns = self._now_ns
+
+    def _calls_for_keyframe(self, kind: int, t_ns: int) -> bool:
+        since_ns = t_ns - self._window[-1].t_ns
+        if since_ns <= self._config.merge_ns:
+            return False
+        period_ns = self._config.period_s * 1e9 - self._config.merge_ns
+        if kind == DVL:
+            return since_ns >= period_ns
+        timeout_ns = self._config.keyframe_timeout_s * 1e9
+        silent_ns = self._now_ns - self._dvl_heard_ns
+        return silent_ns >= timeout_ns and since_ns >= max(period_ns, timeout_ns - self._config.merge_ns)
+
+    def _receive_late(self, reading: NDArray[Any], t_ns: int) -> None:
+        """Tie a reading older than the newest keyframe to the one before it, if that is still in the window."""
+        keyframe = next((k for k in reversed(self._window) if k.t_ns <= t_ns + self._config.merge_ns), None)
+        if keyframe is None:
+            self.counts["late"] += 1
+            return
+        self.counts["late_used"] += 1
+        self._add_reading(keyframe, reading)
+
+    def _make_keyframe(self, t_ns: int) -> None:
+        """Close the newest keyframe's interval at t_ns, start the next one there, and update the smoother."""
+        last = self._window[-1]
+        assert last.before is not None
+        last.imu, rest = split(last.imu, t_ns)
+        last.next_ns = t_ns
+        new = Keyframe(last.index + 1, t_ns, last.imu[-1:], rest)
+        i, j = last.index, new.index
+
+        record, block = self._block(last, self._state, t_ns)
+        state, _, _ = self._predict(record, block, t_ns)
+        preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig)
+        self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
+        pending, self._pending = self._pending, []
+        for reading in pending:
+            at_ns = int(reading["t_ns"][0])
+            if at_ns > t_ns + self._config.merge_ns:
+                self._pending.append(reading)
+            elif self._config.preintegrates and reading["kind"][0] == DVL:
+                self._sum_or_use(last, new, reading)
+            else:
+                self._add_reading(new if abs(at_ns - t_ns) <= self._config.merge_ns else last, reading)
+        if self._config.preintegrates:
+            self._add_displacement(last, new)
+        values = gtsam.Values()
+        insert_state(values, j, state, self._R_BI)
+        self._update(values, new)
+
+    def _update(self, values: gtsam.Values, new: Keyframe) -> None:
+        """Let what is about to leave the window leave with hindsight, then update, and read off the newest state."""
+        t_s = (new.t_ns - self._start_ns) * 1e-9
+        horizon_ns = new.t_ns - int(self._config.lag_s * 1e9) + 1000  # never trust a key at the very edge
+        leaving = []
+        while self._window and self._window[0].t_ns < horizon_ns and self._window[0] is not new:
+            leaving.append(self._window.popleft())
+        self._leave(leaving)
+        stamps = {key(new.index): t_s for key in (X, V, B)}
+        try:
+            self._smoother.update(self._graph, values, stamps)
+        except RuntimeError as error:
+            raise Diverged(f"GTSAM: {explain(error)}") from None
+        self._graph = gtsam.NonlinearFactorGraph()
+        if new.index > 0:
+            self._window.append(new)
+            self._state, self._belief = estimated_state(self._smoother, new.index, self._R_BI), None
+            if not np.isfinite(self._state.p_WB_W).all():
+                raise Diverged("the newest position is not finite")
+        self.counts["keyframes"] += 1
+
+    # --- factors -----------------------------------------------------------------------------------------------------
+
+    def _add_reading(self, keyframe: Keyframe, reading: NDArray[Any]) -> None:
+        """Add the factor of a reading on `keyframe`, carried by the IMU where it was true later."""
+        t_ns = int(reading["t_ns"][0])
+        if abs(t_ns - keyframe.t_ns) <= self._config.merge_ns:
+            self.counts["merged"] += int(t_ns != keyframe.t_ns)
+            self._graph.add(reading_factor(keyframe.index, reading, self._rig))
+            return
+        self.counts["carried"] += 1
+        state = self._state if keyframe is self._window[-1] else self._state_of(keyframe)
+        record, block = self._block(keyframe, state, t_ns)
+        self._graph.add(carried_factor(keyframe.index, reading, block, record, self._rig))
+
+    def _sum_or_use(self, last: Keyframe, new: Keyframe, reading: NDArray[Any]) -> None:
+        """Keep a DVL reading for the interval that it begins or lies in; at a keyframe, by velocity if asked for."""
+        at_new = abs(int(reading["t_ns"][0]) - new.t_ns) <= self._config.merge_ns
+        if at_new and "velocity" in self._config.dvl:
+            self._add_reading(new, reading)
+        else:
+            (new if at_new else last).dvl.append(reading)
+
+    def _add_displacement(self, last: Keyframe, new: Keyframe) -> None:
+        """Add the preintegrated-DVL factor of an interval, or its readings one by one where the DVL was silent."""
+        if not last.dvl:
+            return
+        readings = np.concatenate(last.dvl)
+        times = np.concatenate([[last.t_ns], readings["t_ns"], [new.t_ns]])
+        if np.diff(times).max() > self._config.max_hold_s * 1e9 or not np.isfinite(readings["sigma"]).all():
+            for k in range(len(readings)):
+                self._add_reading(last, readings[k : k + 1])
+            return
+        straight = self._config.dvl_between == "straight"
+        inflate = self._rig["inflate"][0, DVL]
+        dp_ij, cov = preintegrate_dvl(
+            last.imu, last.t_ns, readings["t_ns"].copy(), readings["z"][:, :3].copy(), inflate * readings["sigma"],
+            self._state.b_g, self._rig, straight,
+        )  # fmt: skip
+        self.counts["preintegrated"] += len(readings)
+        self._graph.add(displacement_factor(last.index, new.index, dp_ij, cov))
+
+    # --- states between keyframes ------------------------------------------------------------------------------------
+
+    def _state_of(self, keyframe: Keyframe) -> NavState:
+        return estimated_state(self._smoother, keyframe.index, self._R_BI)
+
+    def _block(self, keyframe: Keyframe, state: NavState, t_ns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the keyframe's state as a record, and the block from it to t_ns."""
+        block = np.zeros(1, BLOCK)
+        record = as_record(Belief(keyframe.t_ns, state, np.zeros((15, 15))))
+        if keyframe.before is None:  # nothing has been lived through yet
+            block["dR"] = np.eye(3)
+            return record, block
+        head, _ = split(keyframe.imu, t_ns)
+        integrate(head, keyframe.before, state.b_a, state.b_g, self._rig, block)
+        return record, block
+
+    def _predict(self, record: NDArray[Any], block: NDArray[Any], t_ns: int) -> tuple[NavState, Array, Array]:
+        """Return the state at the block's end, t_ns, with the transition and the process noise (15, 15)."""
+        end, F, Q = np.zeros(1, STATE), np.empty((15, 15)), np.empty((15, 15))
+        predict(block, record, self._rig[0]["gravity"], F, end)
+        process_noise(block, record[0]["R_WB"], Q)
+        return as_belief(t_ns, end).state, F, Q
+
+    def _carry(self, keyframe: Keyframe, belief: Belief, t_ns: int) -> Belief:
+        """Return a belief at a keyframe, carried to t_ns."""
+        if t_ns == keyframe.t_ns:
+            return belief
+        state, F, Q = self._predict(*self._block(keyframe, belief.state, t_ns), t_ns)
+        return Belief(t_ns, state, sandwich(F, belief.P) + Q)
+
+    # --- hindsight ---------------------------------------------------------------------------------------------------
+
+    def _leave(self, keyframes: list[Keyframe]) -> None:
+        """Record the ticks from each keyframe to the next, as the smoother sees them now."""
+        for keyframe in keyframes:
+            until_ns = self._now_ns + 1 if keyframe.next_ns is None else keyframe.next_ns
+            while self._ticks and self._ticks[0] < until_ns:
+                t_ns = self._ticks.popleft()
+                if t_ns >= self._covariance_due_ns:
+                    self._covariance_due_ns = t_ns + int(self._config.hindsight_covariance_s * 1e9)
+                    belief = estimated_belief(self._smoother, keyframe.index, keyframe.t_ns, self._R_BI)
+                else:
+                    belief = Belief(keyframe.t_ns, self._state_of(keyframe), np.full((15, 15), np.nan))
+                self._hindsight.append(with_rate_noise(self._carry(keyframe, belief, t_ns), self._rig))
+
+
+def _smoother(config: FixedLagSmoother) -> gtsam.IncrementalFixedLagSmoother:
+    rotation, position, velocity, bias = config.relinearize
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("x", np.array([rotation] * 3 + [position] * 3)))
+    thresholds.insert(("v", np.full(3, velocity)))
+    thresholds.insert(("b", np.full(6, bias)))
+    params = gtsam.ISAM2Params()
+    params.setFactorization(config.factorization)
+    params.setRelinearizeThreshold(thresholds)
+    params.relinearizeSkip = 1
+    params.findUnusedFactorSlots = True
+    return gtsam.IncrementalFixedLagSmoother(config.lag_s, params)

@@ -1,0 +1,410 @@
+"""The simulator against the definitions: what an IMU and its companions report, and how noisy they are."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from fathom.datasets import DatasetError, ImuNoise, Log
+from fathom.datasets.epochs import cut
+from fathom.datasets.mission import MISSIONS, fly
+from fathom.datasets.scenario import (
+    IMU_GRADES,
+    DepthSpec,
+    DvlSpec,
+    GpsSpec,
+    HeadingSpec,
+    MountingSpec,
+    PriorSpec,
+    Scenario,
+)
+from fathom.datasets.simulator import (
+    RANDOM_STREAMS,
+    janus_beams,
+    random_stream,
+    simulate,
+    simulate_biases,
+    simulate_white_noise,
+)
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+SENSORS = ("dvl", "depth", "gps", "heading")
+
+
+def arrays(log: Log, *but: str) -> dict[str, np.ndarray]:
+    """Every array of a log by name, except those of the streams named."""
+    out = {"imu.t": log.imu.t_ns, "imu.w": log.imu.w_WI_I, "imu.f": log.imu.f_I}
+    for name, stream in log.streams.items():
+        if name not in but:
+            out |= {f"{name}.{field.name}": getattr(stream, field.name) for field in dataclasses.fields(stream)}
+    out |= {f"truth.{n}": getattr(log.truth, n) for n in ("t_ns", "R_WB", "p_WB_W", "v_WB_W", "b_a", "b_g")}
+    out |= {f"prior.{n}": getattr(log.prior.state, n) for n in ("R_WB", "p_WB_W", "v_WB_W", "b_a", "b_g")}
+    return out
+
+
+def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
+    assert a.keys() == b.keys()
+    for name, value in a.items():
+        assert np.array_equal(value, b[name]), name
+
+
+def assert_variance(samples: np.ndarray, sigma: float) -> None:
+    """Zero-mean samples have this sigma, at 99.9 %."""
+    low, high = chi2.interval(0.999, samples.size)
+    assert low < np.sum((samples / sigma) ** 2) < high
+
+
+def truth_at(log: Log, t_ns: np.ndarray) -> np.ndarray:
+    rows = np.searchsorted(log.truth.t_ns, t_ns)
+    assert np.array_equal(log.truth.t_ns[rows], t_ns)
+    return rows
+
+
+# -- what the IMU reports
+
+
+@pytest.mark.parametrize("mission", MISSIONS)
+def test_samples_are_means_of_the_imus_own_motion(mission):
+    """Dense quadrature over the path of the IMU's point, differentiated twice: no formula of the simulator's."""
+    scenario = Scenario(mission=mission, duration_s=60, noise_scale=0.0)
+    log, motion = simulate(scenario, 3), fly(scenario, random_stream(3, "mission"))
+    imu, h = log.rig.imu, 2e-3
+
+    def point(t_s):
+        R_WB, p_WB_W, _ = motion.pose(t_s)
+        return p_WB_W + R_WB @ imu.p_BS_B
+
+    for k in (0, 1, 1503, 2950, 4444, 5999):
+        t_s = np.linspace(k * 0.01, (k + 1) * 0.01, 101)
+        a_WI_W = (point(t_s + h) - 2 * point(t_s) + point(t_s - h)) / h**2
+        R_WI = motion.pose(t_s)[0] @ imu.R_BS
+        f_I = np.einsum("nji,nj->ni", R_WI, a_WI_W + np.array([0, 0, 9.81]))
+        before, after = motion.pose(t_s - h)[0] @ imu.R_BS, motion.pose(t_s + h)[0] @ imu.R_BS
+        w_WI_I = Rotation.from_matrix(before.transpose(0, 2, 1) @ after).as_rotvec() / (2 * h)
+        np.testing.assert_allclose(log.imu.f_I[k], np.trapezoid(f_I, t_s, axis=0) / 0.01, atol=2e-6)
+        np.testing.assert_allclose(log.imu.w_WI_I[k], np.trapezoid(w_WI_I, t_s, axis=0) / 0.01, atol=1e-6)
+
+
+def mechanise(log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Free inertial navigation of the IMU's own point, with coning and sculling by the sample before (Savage 1998).
+
+    Rotation within a sample is kept to second order: the term α × (α × β) / 6 alone is 28 to 100 mm in 10 minutes.
+    Returns R_WB and p_WB_W at the truth's times, from the truth at the first.
+    """
+    dt, R_BI, p_BI_B = 1 / 100, log.rig.imu.R_BS, log.rig.imu.p_BS_B
+    alpha, beta = log.imu.w_WI_I * dt, log.imu.f_I * dt
+    last_alpha, last_beta = np.vstack([alpha[:1], alpha[:-1]]), np.vstack([beta[:1], beta[:-1]])
+    rotation = Rotation.from_rotvec(alpha + np.cross(last_alpha, alpha) / 12).as_matrix()
+    R_0I = np.concatenate([np.eye(3)[None], rotation])
+    shift = 1
+    while shift < len(R_0I):  # products of all before, by doubling
+        R_0I[shift:] = R_0I[:-shift] @ R_0I[shift:]
+        shift *= 2
+    R_WI = log.truth.R_WB[0] @ R_BI @ R_0I
+    turned, turned_twice = np.cross(alpha, beta), np.cross(alpha, np.cross(alpha, beta))
+    sculling = turned / 2 + turned_twice / 6 + (np.cross(last_alpha, beta) + np.cross(last_beta, alpha)) / 12
+    dv = np.einsum("nij,nj->ni", R_WI[:-1], beta + sculling) - [0, 0, 9.81 * dt]
+    twice = beta / 2 + turned / 6 + turned_twice / 24 - (beta - last_beta) / 12
+    dp = dt * np.einsum("nij,nj->ni", R_WI[:-1], twice) - [0, 0, 9.81 * dt**2 / 2]
+
+    # the IMU's velocity at the start needs the exact rate there, which the log does not hold: from two samples
+    w_0 = R_BI @ (1.5 * log.imu.w_WI_I[0] - 0.5 * log.imu.w_WI_I[1])
+    v_0 = log.truth.v_WB_W[0] + log.truth.R_WB[0] @ np.cross(w_0, p_BI_B)
+    v = v_0 + np.concatenate([np.zeros((1, 3)), np.cumsum(dv, axis=0)])
+    p_0 = log.truth.p_WB_W[0] + log.truth.R_WB[0] @ p_BI_B
+    p = p_0 + np.concatenate([np.zeros((1, 3)), np.cumsum(v[:-1] * dt + dp, axis=0)])
+    R_WB = R_WI @ R_BI.T
+    return R_WB, p - R_WB @ p_BI_B
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("mission", MISSIONS)
+def test_free_inertial_navigation_returns_within_5_mm_after_10_minutes(mission, seed):
+    log = simulate(Scenario(mission=mission, duration_s=600, noise_scale=0.0), seed)
+    R_WB, p_WB_W = mechanise(log)
+    assert np.linalg.norm(p_WB_W - log.truth.p_WB_W, axis=1).max() < 5e-3
+    assert Rotation.from_matrix(R_WB[-1].T @ log.truth.R_WB[-1]).magnitude() < 1e-7
+    assert np.linalg.norm(log.truth.p_WB_W[-1]) > 50  # it had been somewhere
+
+
+def test_a_level_imu_at_rest_feels_gravity_upwards():
+    scenario = Scenario(noise_scale=0.0, wobble_deg=0.0, duration_s=20, imu_mounting=MountingSpec())
+    f_B = simulate(scenario, 0).imu.f_I[0]
+    np.testing.assert_allclose(f_B, [0, 0, 9.81], atol=0.05)
+
+
+# -- what the others report
+
+
+@pytest.mark.parametrize("mission", MISSIONS)
+def test_noise_free_readings_follow_from_the_truth(mission):
+    log = simulate(Scenario(mission=mission, duration_s=300, noise_scale=0.0), 5)
+    truth, rig = log.truth, log.rig
+    at = {name: truth_at(log, stream.t_ns) for name, stream in log.streams.items()}
+    for row, z in zip(at["dvl"], log.dvl.z, strict=True):
+        np.testing.assert_allclose(z, truth.R_WB[row].T @ truth.v_WB_W[row], atol=1e-12)
+    for row, z in zip(at["depth"], log.depth.z, strict=True):
+        np.testing.assert_allclose(z, (truth.p_WB_W[row] + truth.R_WB[row] @ rig.depth.p_BS_B)[2], atol=1e-12)
+    for row, z in zip(at["gps"], log.gps.z, strict=True):
+        np.testing.assert_allclose(z, truth.p_WB_W[row] + truth.R_WB[row] @ rig.gps.p_BS_B, atol=1e-9)
+    for row, z in zip(at["heading"], log.heading.z, strict=True):
+        yaw = Rotation.from_matrix(truth.R_WB[row] @ rig.heading.R_BS).as_euler("ZYX")[0]
+        np.testing.assert_allclose(np.cos(z - yaw), 1.0, atol=1e-12)
+    assert not truth.b_a.any()
+    assert not truth.b_g.any()
+    np.testing.assert_allclose(log.prior.state.local(truth.state(0)), 0, atol=1e-12)
+    assert (np.diag(log.prior.P) > 0).all()
+
+
+@pytest.mark.parametrize("mission", MISSIONS)
+def test_gps_is_heard_only_at_the_surface(mission):
+    log = simulate(Scenario(mission=mission, duration_s=600), 2)
+    antenna_m = log.truth.p_WB_W[:, 2] + (log.truth.R_WB @ log.rig.gps.p_BS_B)[:, 2]
+    each_second = np.flatnonzero((log.truth.t_ns % 1_000_000_000 == 0) & (log.truth.t_ns > 0))
+    expected = log.truth.t_ns[each_second][antenna_m[each_second] > -0.05]
+    assert np.array_equal(log.gps.t_ns, expected)
+    assert log.gps.t_ns[0] == 1_000_000_000
+    assert log.gps.t_ns[-1] == 600_000_000_000
+    assert np.diff(log.gps.t_ns).max() > 150e9  # a long dive
+
+
+def test_dvl_sigma_is_that_of_its_beams():
+    log = simulate(Scenario(duration_s=600, dvl=DvlSpec(rate_hz=50, beam_sigma_mps=0.01, beam_angle_deg=30)), 1)
+    quiet = simulate(
+        Scenario(duration_s=600, dvl=DvlSpec(rate_hz=50, beam_sigma_mps=0.01, beam_angle_deg=30), noise_scale=0), 1
+    )
+    # by hand: two opposite beams give v_x with 1/(2 sin) of their difference; turned by 45° all four share in each
+    np.testing.assert_allclose(log.dvl.sigma[0], 0.01 * np.array([2**0.5, 2**0.5, 1 / 3**0.5]), rtol=1e-12)
+    error = log.dvl.z - quiet.dvl.z
+    for axis in range(3):
+        assert_variance(error[:, axis], log.dvl.sigma[0, axis])
+    correlation = np.corrcoef(error.T) - np.eye(3)
+    assert np.abs(correlation).max() < 4 / np.sqrt(len(error))
+
+
+def test_beams_look_down_and_around():
+    A = janus_beams(np.radians(22.5))
+    np.testing.assert_allclose(np.linalg.norm(A, axis=1), 1)
+    np.testing.assert_allclose(A[:, 2], -np.cos(np.radians(22.5)))
+    np.testing.assert_allclose(A.sum(axis=0)[:2], 0, atol=1e-15)
+
+
+def test_readings_have_the_sigmas_they_state():
+    scenario = Scenario(duration_s=600, gps_mounting=MountingSpec(lever_arm_m=(0, 0, 50)))  # GPS all the time
+    noisy, quiet = simulate(scenario, 4), simulate(dataclasses.replace(scenario, noise_scale=0.0), 4)
+    for name in SENSORS:
+        error = noisy.streams[name].z - quiet.streams[name].z
+        error = np.arctan2(np.sin(error), np.cos(error)) if name == "heading" else error
+        for axis in range(error.shape[1]):
+            assert_variance(error[:, axis], noisy.streams[name].sigma[0, axis])
+
+
+def test_heading_bias_turns_every_heading_counter_clockwise():
+    straight, biased = (
+        simulate(Scenario(duration_s=60, heading=HeadingSpec(bias_deg=bias)), 1).heading.z for bias in (0, 2)
+    )
+    np.testing.assert_allclose(np.exp(1j * (biased - straight)), np.exp(1j * np.radians(2)), atol=1e-12)
+    assert np.abs(simulate(Scenario(course_deg=179), 1).heading.z).max() <= np.pi
+
+
+def test_delay_moves_reception_and_nothing_else():
+    scenario = Scenario(duration_s=60, dvl=DvlSpec(delay_s=0.35), gps=GpsSpec(delay_s=1.2))
+    late, prompt = simulate(scenario, 1), simulate(Scenario(duration_s=60), 1)
+    assert (late.dvl.received_ns - late.dvl.t_ns == 350_000_000).all()
+    assert (late.gps.received_ns - late.gps.t_ns == 1_200_000_000).all()
+    assert (prompt.dvl.received_ns == prompt.dvl.t_ns).all()
+    assert np.array_equal(late.dvl.z, prompt.dvl.z)
+
+
+# -- noise and biases
+
+
+@pytest.mark.parametrize("grade", IMU_GRADES)
+def test_imu_noise_has_the_stated_densities(grade):
+    """Means over 1 s have sigma = density, and single samples density / √dt: white in between."""
+    noise = IMU_GRADES[grade]
+    edges_ns = np.arange(0, 601) * 10_000_000
+    white = np.concatenate([simulate_white_noise(noise, edges_ns, seed) for seed in range(40)])
+    for columns, density in ((slice(0, 3), noise.accel_density), (slice(3, 6), noise.gyro_density)):
+        assert_variance(white[:, columns], density / np.sqrt(0.01))
+        assert_variance(white[:, columns].reshape(-1, 100, 3).mean(axis=1), density)
+
+
+@pytest.mark.parametrize("grade", IMU_GRADES)
+def test_biases_start_and_walk_as_stated(grade):
+    noise = IMU_GRADES[grade]
+    edges_ns = np.arange(0, 101) * 10_000_000
+    b = np.stack([simulate_biases(noise, edges_ns, seed) for seed in range(300)])
+    for columns, sigma, walk in (
+        (slice(0, 3), noise.accel_bias_sigma, noise.accel_walk),
+        (slice(3, 6), noise.gyro_bias_sigma, noise.gyro_walk),
+    ):
+        assert_variance(b[:, 0, columns], sigma)
+        assert_variance(b[:, -1, columns] - b[:, 0, columns], walk)  # after 1 s
+
+
+def test_the_log_is_signal_plus_bias_plus_noise():
+    noisy, quiet = (simulate(Scenario(duration_s=120, noise_scale=scale), 6) for scale in (1.0, 0.0))
+    noise = noisy.rig.imu_noise
+    gyro = noisy.imu.w_WI_I - quiet.imu.w_WI_I - noisy.truth.b_g[:-1]
+    accel = noisy.imu.f_I - quiet.imu.f_I - noisy.truth.b_a[:-1]
+    assert_variance(gyro, noise.gyro_density * 10)
+    assert_variance(accel, noise.accel_density * 10)
+    assert np.linalg.norm(noisy.truth.b_a[0]) > 0.1 * noise.accel_bias_sigma
+    assert np.array_equal(noisy.truth.p_WB_W, quiet.truth.p_WB_W)
+
+
+def test_a_sample_carries_the_bias_of_its_intervals_beginning():
+    """So much walk and so little noise that one step either way would show."""
+    imu = ImuNoise(1e-9, 1e-9, 0.1, 0.1, 1e-3, 1e-3)
+    walking, quiet = (simulate(Scenario(duration_s=20, imu=imu, noise_scale=scale), 6) for scale in (1.0, 0.0))
+    np.testing.assert_allclose(walking.imu.w_WI_I - quiet.imu.w_WI_I, walking.truth.b_g[:-1], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(walking.imu.f_I - quiet.imu.f_I, walking.truth.b_a[:-1], rtol=0, atol=1e-7)
+
+
+def test_better_grades_are_better():
+    grades = [dataclasses.astuple(IMU_GRADES[g]) for g in ("consumer", "industrial", "tactical", "navigation")]
+    gyro = np.array(grades)[:, [0, 2, 4]]
+    assert (np.diff(gyro, axis=0) < 0).all()
+
+
+def test_prior_error_has_the_covariance_it_states():
+    seeds = range(200)
+    errors, nees = [], []
+    for seed in seeds:
+        log = simulate(Scenario(duration_s=20, imu_rate_hz=5, prior=PriorSpec(attitude_deg=2)), seed)
+        assert not log.prior.state.b_a.any()
+        assert not log.prior.state.b_g.any()
+        errors.append(log.prior.state.local(log.truth.state(0)) / np.sqrt(np.diag(log.prior.P)))
+        nees.append(errors[-1] @ errors[-1])
+    low, high = chi2.interval(0.999, 15 * len(seeds))
+    assert low < sum(nees) < high
+    for component in np.array(errors).T:
+        assert_variance(component, 1.0)
+
+
+# -- seeds and streams
+
+
+def test_same_seed_same_log_and_other_seed_other_log():
+    scenario = Scenario(duration_s=60)
+    one, again, other = (arrays(simulate(scenario, seed)) for seed in (7, 7, 8))
+    assert_same(one, again)
+    changed = {name for name in one if not np.array_equal(one[name], other[name])}
+    assert {"imu.w", "imu.f", "dvl.z", "depth.z", "gps.z", "heading.z", "truth.p_WB_W", "prior.p_WB_W"} <= changed
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_dropping_or_changing_one_sensor_changes_no_other(sensor):
+    base = Scenario(duration_s=60)
+    other_spec = {
+        "dvl": DvlSpec(beam_sigma_mps=0.02, rate_hz=7),
+        "depth": DepthSpec(sigma_m=0.1),
+        "gps": GpsSpec(rate_hz=2),
+        "heading": HeadingSpec(bias_deg=5),
+    }[sensor]
+    expected = arrays(simulate(base, 7), sensor)
+    for value in (None, other_spec):
+        log = simulate(dataclasses.replace(base, **{sensor: value}), 7)
+        assert (getattr(log, sensor) is None) == (value is None)
+        assert_same(arrays(log, sensor), expected)
+
+
+def test_changing_the_imu_changes_neither_path_nor_aiding():
+    tactical, consumer = (simulate(Scenario(duration_s=60, imu=grade), 7) for grade in ("tactical", "consumer"))
+    for name in ("truth.p_WB_W", "dvl.z", "gps.z", "heading.z", "depth.z", "prior.p_WB_W", "prior.R_WB"):
+        assert np.array_equal(arrays(tactical)[name], arrays(consumer)[name]), name
+
+
+def test_a_longer_log_begins_with_the_same_noise():
+    short, long = (simulate_biases(IMU_GRADES["tactical"], np.arange(n) * 10_000_000, 3) for n in (100, 200))
+    assert np.array_equal(short, long[:100])
+
+
+def test_random_streams_are_distinct():
+    assert len(set(RANDOM_STREAMS.values())) == len(RANDOM_STREAMS)
+    draws = [random_stream(seed, cause).random() for seed in range(5) for cause in RANDOM_STREAMS]
+    assert len(set(draws)) == len(draws)
+
+
+# -- the log as a whole
+
+
+@pytest.mark.parametrize("start_ns", [0, 1_700_000_000_000_000_123])
+def test_times_are_exact_integers(start_ns):
+    log = simulate(Scenario(duration_s=60, start_ns=start_ns), 1)
+    assert log.imu.t_ns.dtype == np.int64
+    assert np.array_equal(log.imu.t_ns, start_ns + np.arange(1, 6001) * 10_000_000)
+    assert np.array_equal(log.truth.t_ns, start_ns + np.arange(6001) * 10_000_000)
+    assert np.array_equal(log.dvl.t_ns, start_ns + np.arange(1, 301) * 200_000_000)
+    assert log.start_ns == log.prior.t_ns == start_ns
+    assert log.duration_s == pytest.approx(60)
+    expected = simulate(Scenario(duration_s=60), 1)
+    assert np.array_equal(log.imu.f_I, expected.imu.f_I)
+
+
+@pytest.mark.parametrize("mission", MISSIONS)
+@pytest.mark.parametrize("duration_s", [20.0, 33.3, 1200.0])
+def test_every_duration_makes_a_log_that_can_be_cut(mission, duration_s):
+    voyage = cut(simulate(Scenario(mission=mission, duration_s=duration_s), 9))
+    assert voyage.failure is None
+    assert voyage.counts == {"imu_gaps_bridged": 0, "readings_outside": 0}
+
+
+def test_the_log_says_what_it_is():
+    log = simulate(Scenario(duration_s=60), 7)
+    assert log.name == "lawnmower-tactical-s7"
+    assert "seed 7" in log.notes[0]
+    assert log.truth_kind == "truth"
+    custom = ImuNoise(1e-4, 1e-3, 0.0, 0.0, 1e-4, 1e-2)
+    assert simulate(Scenario(duration_s=60, imu=custom, mission="yo-yo"), 7).name == "yo-yo-custom-s7"
+
+
+# -- scenarios
+
+
+def test_scenario_survives_a_file():
+    scenario = Scenario(
+        mission="yo-yo", imu=IMU_GRADES["consumer"], gps=None, dvl=DvlSpec(delay_s=0.1), prior=PriorSpec(position_m=2)
+    )
+    assert Scenario.from_dict(json.loads(json.dumps(scenario.to_dict()))) == scenario
+    assert Scenario.from_dict({}) == Scenario()
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"mision": "yo-yo"}, ["mision", "did you mean 'mission'"]),
+        ({"mission": "lawnmover"}, ["mission", "did you mean 'lawnmower'"]),
+        ({"imu": "tacticel"}, ["imu", "did you mean 'tactical'"]),
+        ({"imu_rate_hz": -100}, ["imu_rate_hz", "greater than 0", "-100"]),
+        ({"dvl": {"rate": 5}}, ["dvl.rate", "did you mean 'rate_hz'"]),
+        ({"dvl": {"rate_hz": 0}}, ["dvl.rate_hz", "greater than 0"]),
+        ({"duration_s": 5}, ["duration_s", "20"]),
+        ({"duration_s": float("nan")}, ["duration_s"]),
+        ({"speed_mps": float("inf")}, ["speed_mps", "finite"]),
+        ({"imu_mounting": {"lever_arm": [0, 0, 0]}}, ["imu_mounting.lever_arm", "did you mean 'lever_arm_m'"]),
+        ({"imu": {"gyro_densty": 1e-4}}, ["imu.gyro_densty", "did you mean 'gyro_density'"]),
+        ({"imu": 3}, ["imu"]),
+        ({"mission": "yo-yo", "depth_m": 3}, ["shallow_m", "less than"]),
+        ([1, 2], ["mapping"]),
+    ],
+)
+def test_a_bad_scenario_is_refused_by_name(values, words):
+    with pytest.raises(DatasetError) as caught:
+        Scenario.from_dict(values, source="here.yaml")
+    for word in ["here.yaml", *words]:
+        assert word in str(caught.value)
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ValidationError, match="did you mean 'yo-yo'"):
+        Scenario(mission="yoyo")
+    with pytest.raises(ValidationError, match="gyro_density"):
+        Scenario(imu=ImuNoise(-1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+    with pytest.raises(DatasetError, match="seed"):
+        simulate(Scenario(duration_s=20), -1)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Scenario().duration_s = 3
