@@ -45,6 +45,21 @@ class Align(StrEnum):
     se3 = "se3"
 
 
+class Unit(StrEnum):
+    """What the step of the RPE is counted in."""
+
+    frames = "frames"
+    s = "s"
+    m = "m"
+
+
+class Pairs(StrEnum):
+    """Which steps the RPE is taken over."""
+
+    consecutive = "consecutive"
+    all = "all"
+
+
 Data = Annotated[Path | None, typer.Option(envvar="FATHOM_DATA", help="Where recorded logs are.")]
 Repair = Annotated[bool, typer.Option("--repair", help="Drop bad rows of logs, and count them.")]
 
@@ -174,34 +189,50 @@ def score(
     align: Annotated[Align, typer.Option(help="What the estimate is forgiven.")] = Align.none,
     tolerance_s: Annotated[float, typer.Option(min=0, help="How far apart in time two poses may be.")] = 0.01,
     delta: Annotated[float, typer.Option(help="Step of the RPE.")] = 1.0,
-    unit: Annotated[str, typer.Option(help="frames, s or m.")] = "m",
-    pairs: Annotated[str, typer.Option(help="consecutive or all.")] = "all",
+    unit: Annotated[Unit, typer.Option(help="Of the step.")] = Unit.m,
+    pairs: Annotated[Pairs, typer.Option(help="Which steps.")] = Pairs.all,
 ) -> None:
     """Print ATE and RPE of ESTIMATE against TRUTH."""
     with refusing_bad_input():
-        from rich.console import Console
-        from rich.table import Table
-
         from ..datasets.trajectory import Trajectory
-        from .metrics import ate, rpe
+        from .metrics import ScoreError, ate, rpe
 
         true, estimated = Trajectory.from_tum(truth), Trajectory.from_tum(estimate)
         tolerance_ns = round(tolerance_s * 1e9)
         absolute = ate(true, estimated, align.value, tolerance_ns)
-        relative = rpe(true, estimated, delta, unit, pairs, tolerance_ns)  # pyright: ignore[reportArgumentType]
-        table = Table("", "rmse", "mean", "median", "std", "min", "max", "over")
-        what = (
-            (absolute, "{}_m", "ATE, m", f"{absolute.n} poses"),
-            (absolute, "rotation_{}_deg", "ATE, °", f"{absolute.n} poses"),
-            (relative, "{}_m", "RPE, m", f"{relative.n} pairs"),
-            (relative, "rotation_{}_deg", "RPE, °", f"{relative.n} pairs"),
-        )
-        for numbers, name, title, over in what:
-            values = [getattr(numbers, name.format(key)) for key in ("rmse", "mean", "median", "std", "min", "max")]
-            table.add_row(title, *("–" if value is None else f"{value:.6f}" for value in values), over)
-        Console().print(table)
-        over = f"RPE over {delta:g} {unit}, {pairs} pairs"
-        typer.echo(f"alignment: {absolute.alignment}; {over}; matched within {tolerance_s:g} s")
+        rows = _score_rows("ATE", absolute, f"{absolute.n} poses")
+        settings = f"alignment: {align.value}; matched within {tolerance_s:g} s"
+        try:
+            relative = rpe(true, estimated, delta, unit.value, pairs.value, tolerance_ns)
+            rows += _score_rows("RPE", relative, f"{relative.n} pairs")
+            settings += f"; RPE over {delta:g} {unit.value}, {pairs.value} pairs"
+        except ScoreError as error:
+            settings += f"\nno RPE: {error}"
+        _print_scores(rows)
+        typer.echo(settings)
+
+
+STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+
+
+def _score_rows(title: str, numbers: object, over: str) -> list[list[str]]:
+    rows = []
+    for unit, name in (("m", "{}_m"), ("°", "rotation_{}_deg")):
+        values = [getattr(numbers, name.format(statistic)) for statistic in STATISTICS]
+        rows.append([f"{title} {unit}", *("–" if value is None else f"{value:.6f}" for value in values), over])
+    return rows
+
+
+def _print_scores(rows: list[list[str]]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("", *STATISTICS, "over", box=box.SIMPLE_HEAD)
+    for row in rows:
+        table.add_row(*row)
+    console = Console()
+    (console if console.is_terminal else Console(width=120)).print(table)
 
 
 @contextmanager

@@ -72,8 +72,11 @@ def initialise(log: Log, window_s: float = 2.0, max_wait_s: float = 10.0) -> Ini
     # errors by independent causes: accelerometer bias (3), motion (3), yaw (1), velocity (3), place (3), gyro bias (3)
     f_norm = float(np.linalg.norm(f_B)) or 1.0
     tilt = _skew(f_B) / f_norm**2  # theta × f_B = bias + motion
+    h_W = R_WB @ np.asarray(rig.heading.R_BS)[:, 0]  # a tilt must not turn it: its azimuth was measured
+    level_W = np.array([h_W[0], h_W[1], 0.0])
+    tilt = tilt + np.outer(up_B, level_W @ R_WB @ tilt) * h_W[2] / max(float(level_W @ level_W), 1e-3)
     A, sigma = np.zeros((DIM, 16)), np.zeros(16)
-    A[THETA, 0:3], A[THETA, 3:6], A[THETA, 6] = tilt @ R_BI, tilt, up_B
+    A[THETA, 0:3], A[THETA, 3:6], A[THETA, 6] = tilt @ R_EB.mean(axis=0) @ R_BI, tilt, up_B
     A[ACCEL_BIAS, 0:3] = np.eye(3)
     A[VELOCITY] = -R_WB @ _skew(v_B) @ A[THETA]
     A[VELOCITY, 7:10] = R_WB
@@ -86,9 +89,8 @@ def initialise(log: Log, window_s: float = 2.0, max_wait_s: float = 10.0) -> Ini
     notes += said
     A[POSITION, 10:13], sigma[10:13] = np.eye(3), p_sigma
     P = (A * sigma**2) @ A.T
-    P = (P + P.T) / 2 + np.diag(
-        np.repeat([1e-10, 0.0, 0.0, 1e-12, 1e-14], 3)
-    )  # positive definite even for a perfect IMU
+    floor = np.repeat([1e-10, 0.0, 0.0, 1e-12, 1e-14], 3)  # positive definite even for a perfect IMU
+    P = (P + P.T) / 2 + np.diag(floor)
     state = NavState(R_WB, p_WB_W, v_WB_W, np.zeros(3), np.zeros(3))
     return Initialisation(Belief(end_ns, state, P), tuple(notes))
 

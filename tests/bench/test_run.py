@@ -90,7 +90,7 @@ def test_beliefs_stand_at_the_truths_own_stamps_and_every_step_is_timed(log: Log
 def test_a_constant_offset_is_the_ate_and_leaves_the_rpe_at_zero(log: Log) -> None:
     row = scores(log, run_log(log, Fake(truthful(log, (3.0, 4.0, 0.0)))).online, Scoring(rpe_delta=5.0, rpe_unit="s"))
     assert row["ate_rmse_m"] == pytest.approx(5.0)
-    assert row["ate_max_m"] == row["drms_m"] == row["cep50_m"] == pytest.approx(5.0)
+    assert [row[name] for name in ("ate_max_m", "drms_m", "cep50_m")] == pytest.approx([5.0] * 3)
     assert row["rotation_rmse_deg"] == pytest.approx(0.0, abs=1e-5)
     assert row["rpe_rmse_m"] == pytest.approx(0.0, abs=1e-9)
     assert row["velocity_rmse_m_s"] == pytest.approx(0.0, abs=1e-12)

@@ -10,7 +10,7 @@ from fathom.datasets import ImuNoise, Log, Mounting, Rig
 from fathom.datasets.epochs import cut
 from fathom.datasets.initialise import initialise
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream
-from fathom.datasets.state import GYRO_BIAS, POSITION, THETA, VELOCITY, NavState
+from fathom.datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, NavState
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -104,6 +104,30 @@ def test_its_errors_are_covered_by_its_covariance(drop):
     # an upper bound only: it allows for accelerations that this voyage does not have
     assert sum(nees) < chi2.ppf(0.999, 15 * 60)
     assert sum(nees) > 0.2 * 15 * 60
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_says(seed):
+    log, state, _ = voyage(seed, noisy=False)
+    b_a = np.random.default_rng(seed).normal(size=3) * 0.05
+    biased = initialise(replace(log, imu=replace(log.imu, f_I=log.imu.f_I + b_a))).belief
+    before = initialise(log).belief.state.local(state)
+    moved = biased.state.local(state) - before
+    for part in (THETA, VELOCITY):
+        expected = biased.P[part, ACCEL_BIAS] @ np.linalg.solve(biased.P[ACCEL_BIAS, ACCEL_BIAS], b_a)
+        assert np.linalg.norm(moved[THETA]) > 1e-3
+        np.testing.assert_allclose(moved[part], expected, atol=0.1 * np.linalg.norm(moved[part]) + 2e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wrong_heading_turns_the_velocity_as_the_covariance_says(seed):
+    log, state, _ = voyage(seed, noisy=False)
+    assert log.heading is not None
+    wrong = initialise(replace(log, heading=replace(log.heading, z=log.heading.z + 0.03))).belief
+    moved = wrong.state.local(state) - initialise(log).belief.state.local(state)
+    expected = wrong.P[VELOCITY, THETA] @ np.linalg.solve(wrong.P[THETA, THETA], moved[THETA])
+    assert np.linalg.norm(moved[THETA]) > 0.02
+    np.testing.assert_allclose(moved[VELOCITY], expected, atol=0.1 * np.linalg.norm(moved[VELOCITY]) + 1e-4)
 
 
 def test_its_readings_are_not_in_the_epochs_that_follow():

@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+from fathom.bench.experiment import Experiment
+from fathom.bench.figures import (
+    draw_costs,
+    draw_errors,
+    draw_figures,
+    draw_tracks,
+    load_trajectory,
+    looks_of,
+    tracks_of,
+)
+from fathom.bench.runner import Bench, Task
+from fathom.bench.store import COLUMNS
+from fathom.bench.table import print_table, records, summarise, write_table
+from rich.console import Console
+
+LABELS = ("dead-reckoning", "eskf")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("figures")
+
+
+@pytest.fixture(scope="module")
+def rows(folder: Path) -> pd.DataFrame:
+    """Two estimators on one short dive, run in this process."""
+    plan = Experiment.from_dict(
+        {
+            "name": "f",
+            "logs": [{"scenario": {"duration_s": 40}}],
+            "estimators": [{"name": label} for label in LABELS],
+            "seeds": [2],
+        }
+    )
+    bench = Bench()
+    found = [row for run in plan.runs() for row in bench.execute(Task(plan, run, folder))]
+    return pd.DataFrame(found).reindex(columns=list(COLUMNS))
+
+
+def test_every_figure_is_a_pdf_and_a_legible_png(rows: pd.DataFrame, folder: Path) -> None:
+    files = draw_figures(rows, folder)
+    names = ("lawnmower-tactical-tracks", "lawnmower-tactical-errors", "accuracy-cost")
+    assert {file.name for file in files} == {f"{name}{suffix}" for name in names for suffix in (".pdf", ".png")}
+    for file in files:
+        if file.suffix == ".pdf":
+            assert file.read_bytes().startswith(b"%PDF")
+        else:
+            height, width = matplotlib.image.imread(file).shape[:2]
+            assert width > 1000
+            assert height > 300
+
+
+def test_the_tracks_have_equal_axes_and_the_truth(rows: pd.DataFrame, folder: Path) -> None:
+    tracks, seed = tracks_of(records(rows), folder / "trajectories")
+    assert seed == 2
+    (axes,) = draw_tracks(tracks, looks_of(LABELS), "t").axes
+    assert axes.get_aspect() == 1.0
+    assert [line.get_label() for line in axes.lines] == ["truth", "start", *LABELS]
+    assert tracks[0].truth is not None
+    assert np.array_equal(axes.lines[0].get_xydata(), tracks[0].truth.p_WB_W[:, :2])
+
+
+def test_a_track_that_got_lost_does_not_set_the_scale(rows: pd.DataFrame, folder: Path) -> None:
+    tracks, _ = tracks_of(records(rows), folder / "trajectories")
+    before = draw_tracks(tracks, looks_of(LABELS), "t").axes[0].get_xlim()
+    p = tracks[0].estimate.p_WB_W.copy()
+    p[-1] = 1e6
+    tracks[0] = tracks[0]._replace(estimate=replace(tracks[0].estimate, p_WB_W=p))
+    assert draw_tracks(tracks, looks_of(LABELS), "t").axes[0].get_xlim()[1] < before[1] + 50
+
+
+def test_the_errors_are_the_errors_and_the_band_is_three_sigma(rows: pd.DataFrame, folder: Path) -> None:
+    tracks, _ = tracks_of(records(rows), folder / "trajectories")
+    figure = draw_errors(tracks, looks_of(LABELS), "t")
+    assert len(figure.axes) == 2 * 3
+    eskf = tracks[1]
+    north = figure.axes[3 + 1]
+    assert eskf.truth is not None
+    assert eskf.estimate.P is not None
+    assert np.array_equal(north.lines[0].get_ydata(), eskf.estimate.p_WB_W[:, 1] - eskf.truth.p_WB_W[:, 1])
+    (band,) = north.collections
+    edge = np.abs(band.get_paths()[0].vertices[:, 1]).max()
+    assert edge == pytest.approx(3 * np.sqrt(eskf.estimate.P[:, 4, 4].max()), rel=1e-6)
+    assert not figure.axes[0].collections  # dead reckoning claims no covariance
+
+
+def test_a_saved_trajectory_keeps_states_exactly_and_covariance_blocks(rows: pd.DataFrame, folder: Path) -> None:
+    name = rows.set_index("label").loc["eskf", "trajectory"]
+    trajectory = load_trajectory(folder / "trajectories" / str(name))
+    assert trajectory.P is not None
+    assert np.isfinite(trajectory.P[:, 3:6, 3:6]).all()
+    assert np.isnan(trajectory.P[:, 0, 3]).all()
+    assert (np.linalg.eigvalsh(trajectory.P[:, 3:6, 3:6]) > 0).all()
+
+
+def test_every_label_has_a_look_of_its_own() -> None:
+    labels = [str(k) for k in range(64)]
+    looks = looks_of(labels)
+    assert list(looks) == labels
+    assert len({(look.colour, look.marker) for look in looks.values()}) == 64
+
+
+def test_accuracy_against_cost_is_logarithmic_with_a_panel_per_log(rows: pd.DataFrame) -> None:
+    axes = draw_costs(summarise(rows), looks_of(LABELS)).axes
+    assert len(axes) == 1
+    assert (axes[0].get_xscale(), axes[0].get_yscale()) == ("log", "log")
+
+
+def test_the_terminals_table_and_the_csv_say_the_same(rows: pd.DataFrame, tmp_path: Path) -> None:
+    console = Console(width=80, record=True, file=(tmp_path / "terminal").open("w"))
+    print_table(rows, console)
+    console.file.close()
+    text = console.export_text()
+    write_table(rows, tmp_path / "table.csv")
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert table["label"].tolist() == list(LABELS)
+    for _, row in table.iterrows():
+        assert f"{row['ate_rmse_m']:.3g}" in text
+    assert "alignment: none" in text
+    assert "against the truth" in text
+    assert "–" in text  # dead reckoning's NEES
+    assert "…" not in text

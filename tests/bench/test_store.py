@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from fathom.bench.experiment import ExperimentError
+from fathom.bench.store import COLUMNS, Store, load_runs, provenance
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    identity = {"experiment": "e", "log": "l", "label": "eskf", "seed": 1, "output": "online"}
+    return identity | {"status": "done", "ate_rmse_m": 1.5} | changes
+
+
+def test_rows_come_back_with_absent_numbers_absent(tmp_path: Path) -> None:
+    with Store(tmp_path / "new" / "runs.sqlite") as store:
+        store.write([row(heading_rmse_deg=float("nan"), rpe_rmse_m=None, lookahead_s=np.inf)])
+        store.write([row(seed=None, label="fls")])
+    table = load_runs(tmp_path / "new")
+    assert list(table.columns) == list(COLUMNS)
+    assert table["ate_rmse_m"].tolist() == [1.5, 1.5]
+    assert table[["heading_rmse_deg", "rpe_rmse_m", "drms_m"]].isna().all(axis=None)
+    assert np.isinf(table["lookahead_s"][0])
+    assert table["seed"][0] == 1
+    assert pd.isna(table["seed"][1])
+
+
+@pytest.mark.parametrize("seed", [1, None])
+def test_a_run_replaces_all_rows_of_its_predecessor_and_no_others(tmp_path: Path, seed: int | None) -> None:
+    with Store(tmp_path / "runs.sqlite") as store:
+        store.write([row(seed=seed), row(seed=seed, output="hindsight")])
+        store.write([row(seed=7)])
+        store.write([row(seed=seed, status="failed", ate_rmse_m=None)])
+        table = store.read()
+    assert table["status"].tolist() == ["done", "failed"]
+    assert table["output"].tolist() == ["online", "online"]
+
+
+def test_a_run_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    with Store(tmp_path / "runs.sqlite") as store:
+        store.write([row()])
+        with pytest.raises(ExperimentError, match="cannot write"):
+            store.write([row(ate_rmse_m=9.0), row(output="hindsight", no_such_column=1)])
+        assert store.read()["ate_rmse_m"].tolist() == [1.5]
+
+
+def test_two_rows_of_one_name_cannot_be(tmp_path: Path) -> None:
+    with Store(tmp_path / "runs.sqlite") as store, pytest.raises(sqlite3.IntegrityError):
+        store.write([row(seed=None), row(seed=None)])
+
+
+def test_what_was_written_is_there_when_the_writer_is_killed(tmp_path: Path) -> None:
+    store = Store(tmp_path / "runs.sqlite")
+    store.write([row()])
+    store.connection.execute("BEGIN")
+    store.connection.execute("DELETE FROM runs")  # in flight, never committed
+    assert len(load_runs(tmp_path)) == 1  # another connection, as after a kill
+    store.close()
+    assert len(load_runs(tmp_path)) == 1
+
+
+def test_a_store_of_an_older_version_gains_columns_and_keeps_rows(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as old, old:
+        old.execute("CREATE TABLE runs (experiment TEXT, log TEXT, label TEXT, seed INTEGER, output TEXT, status TEXT)")
+        old.execute("INSERT INTO runs VALUES ('e', 'l', 'old', 1, 'online', 'done')")
+    with Store(tmp_path / "runs.sqlite") as store:
+        store.write([row()])
+        table = store.read()
+    assert table["label"].tolist() == ["old", "eskf"]
+    assert table["ate_rmse_m"].isna().tolist() == [True, False]
+
+
+def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "runs.sqlite"
+    file.write_text("my thesis\n" * 1000)
+    with pytest.raises(ExperimentError, match="not a store of runs"):
+        Store(file)
+    assert file.read_text().startswith("my thesis")
+    with pytest.raises(ExperimentError, match="no such file"):
+        load_runs(tmp_path / "elsewhere")
+
+
+def test_provenance_names_commit_versions_and_machine() -> None:
+    assert set(provenance()) == {"commit_id", "versions", "machine"}
+    assert set(provenance()) <= set(COLUMNS)

@@ -1,0 +1,282 @@
+"""The smoother agrees with the filter, with dense least squares, and with itself whatever the keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from fathom.bench.metrics import ate
+from fathom.bench.run import run_log
+from fathom.datasets import Belief, Log, Trajectory
+from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, cut
+from fathom.datasets.scenario import DvlSpec, GpsSpec, HeadingSpec, Scenario
+from fathom.datasets.simulator import simulate
+from fathom.estimators import FACTORS, Diverged, create
+from fathom.estimators.gtsam_border import carried_factor, displacement_factor, insert_state, prior_factor, reading_factor
+from fathom.estimators.imu import BLOCK, compile_rig, integrate
+from fathom.estimators.records import as_record
+from gtsam.symbol_shorthand import B, V, X
+from paths import Path, random_rig, random_rotation, random_state, reading
+
+TACTICAL = Scenario(duration_s=120.0, imu="tactical")
+
+
+def position_gap_in_sigma(a: Trajectory, b: Trajectory, after_s: float) -> np.ndarray:
+    rows = a.t_ns - a.t_ns[0] > after_s * 1e9
+    sigma = np.sqrt(np.einsum("nii->ni", a.P)[:, 3:6])
+    return (np.abs(a.p_WB_W - b.p_WB_W) / sigma)[rows]
+
+
+@pytest.mark.parametrize("mission", ["lawnmower", "yo-yo"])
+def test_filter_and_smoother_agree_online(mission: str) -> None:
+    """After the first minute: positions within a tenth of a sigma, every standard deviation within 2 %."""
+    log = simulate(replace(TACTICAL, mission=mission), seed=4)
+    eskf, fls = (run_log(log, create(name)).online for name in ("eskf", "fls"))
+    assert position_gap_in_sigma(eskf, fls, 60.0).max() < 0.1
+    ratio = np.sqrt(np.einsum("nii->ni", fls.P) / np.einsum("nii->ni", eskf.P))
+    assert np.abs(ratio[60:] - 1).max() < 0.02
+
+
+@pytest.mark.parametrize("lag_s", [3.0, 10.0])
+def test_hindsight_beats_the_moment(lag_s: float) -> None:
+    """Pooled over seeds: a smoother that loses to its own filter has a bug. Velocity shows it best; position drifts."""
+    online = hindsight = 0.0
+    for seed in range(3):
+        log = simulate(Scenario(duration_s=60.0, imu="tactical"), seed=seed)
+        result = run_log(log, create("fls", lag_s=lag_s))
+        rows = np.searchsorted(log.truth.t_ns, result.online.t_ns)
+        online += np.square(result.online.v_WB_W - log.truth.v_WB_W[rows]).sum()
+        hindsight += np.square(result.smoothed.v_WB_W - log.truth.v_WB_W[rows]).sum()
+        assert np.array_equal(result.smoothed.t_ns, result.online.t_ns)
+        assert result.smoothed.lookahead_s == lag_s
+    assert hindsight < 0.8 * online
+
+
+def test_hindsight_covariance_is_smaller_than_the_moments() -> None:
+    result = run_log(simulate(Scenario(duration_s=60.0, imu="tactical"), seed=1), create("fls", lag_s=5.0))
+    kept = np.isfinite(result.smoothed.P[:, 0, 0])
+    assert 5 <= kept.sum() < len(kept)
+    online, hindsight = (np.einsum("nii->ni", t.P[kept]) for t in (result.online, result.smoothed))
+    assert (hindsight[:-1] <= online[:-1] * (1 + 1e-6)).all()
+
+
+def test_one_second_keyframes_lose_nothing() -> None:
+    """Readings between keyframes are carried by the IMU, neither dropped nor moved: nearly the same estimate."""
+    log = simulate(replace(TACTICAL, duration_s=60.0), seed=2)
+    every, sparse = (run_log(log, create("fls", **o)) for o in ({}, {"keyframe_period_s": 1.0}))
+    assert sparse.counts["keyframes"] < every.counts["keyframes"] / 4
+    assert sparse.counts["carried"] > 500
+    assert position_gap_in_sigma(every.online, sparse.online, 20.0).max() < 0.3
+
+
+def test_preintegrated_dvl_navigates_about_as_well_as_velocity() -> None:
+    log = simulate(replace(TACTICAL, duration_s=60.0), seed=2)
+    results = {
+        "velocity": run_log(log, create("fls", keyframe_period_s=1.0)),
+        "held": run_log(log, create("fls", dvl=["preintegrated-loose"])),
+        "straight": run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between="straight")),
+        "both": run_log(log, create("fls", dvl=["preintegrated-loose", "velocity"])),
+    }
+    rmse = {name: ate(log.truth, result.online).rmse_m for name, result in results.items()}
+    for name, result in results.items():
+        assert result.status == "done", (name, result.cause)
+        assert rmse[name] < 1.3 * rmse["velocity"] + 0.05, rmse
+    assert results["held"].counts["preintegrated"] > 250
+    assert results["both"].counts["preintegrated"] > 200
+
+
+def test_with_both_dvl_factors_no_reading_is_used_twice() -> None:
+    log = simulate(replace(TACTICAL, duration_s=30.0), seed=2)
+    counts = run_log(log, create("fls", dvl=["preintegrated-loose", "velocity"], factors=["dvl"])).counts
+    velocities = counts["keyframes"] - 1  # one at each keyframe but the first
+    assert counts["preintegrated"] + velocities <= len(log.dvl)
+
+
+def _late(scenario: Scenario, delay_s: float) -> Scenario:
+    return replace(scenario, gps=GpsSpec(delay_s=delay_s), heading=HeadingSpec(delay_s=delay_s))
+
+
+def test_late_readings_inside_the_window_are_used_and_older_ones_counted() -> None:
+    scenario = replace(TACTICAL, duration_s=60.0)
+    late = simulate(_late(scenario, 1.0), seed=3)
+    inside = run_log(late, create("fls", lag_s=3.0))
+    n = sum(np.count_nonzero(s.received_ns <= late.imu.t_ns[-1]) for s in (late.gps, late.heading))
+    assert inside.status == "done"
+    assert inside.counts["late_used"] == n
+    beyond = run_log(simulate(_late(scenario, 5.0), seed=3), create("fls", lag_s=3.0))
+    assert beyond.status == "done"
+    assert beyond.counts["late"] > 0.9 * sum(len(s) - 30 for s in (late.gps, late.heading))
+
+
+def test_a_late_reading_is_worth_the_same_in_hindsight() -> None:
+    scenario = replace(TACTICAL, duration_s=60.0)
+    in_time, late = (run_log(simulate(s, seed=3), create("fls", lag_s=10.0)) for s in (scenario, _late(scenario, 1.0)))
+    rows = slice(0, 50)  # their look-ahead held the late readings too
+    gap = np.linalg.norm(in_time.smoothed.p_WB_W - late.smoothed.p_WB_W, axis=1)[rows]
+    assert gap.max() < 0.03
+
+
+def test_a_late_dvl_makes_keyframes_where_it_was_true() -> None:
+    scenario = replace(TACTICAL, duration_s=60.0)
+    log = simulate(replace(scenario, dvl=DvlSpec(delay_s=0.5)), seed=3)
+    late, in_time = run_log(log, create("fls")), run_log(simulate(scenario, seed=3), create("fls"))
+    assert late.status == "done"
+    assert late.counts["keyframes"] > 0.9 * in_time.counts["keyframes"]
+    assert ate(log.truth, late.online).rmse_m < 1.5 * ate(log.truth, in_time.online).rmse_m + 0.05
+
+
+def test_a_silent_dvl_leaves_keyframes_to_the_others() -> None:
+    log = replace(simulate(replace(TACTICAL, duration_s=20.0), seed=3), dvl=None)
+    result = run_log(log, create("fls", keyframe_timeout_s=0.5))
+    assert result.status == "done"
+    assert 36 <= result.counts["keyframes"] <= 42
+
+
+def test_imu_alone_runs() -> None:
+    log = replace(simulate(Scenario(duration_s=20.0), seed=3), dvl=None, depth=None, gps=None, heading=None)
+    result = run_log(log, create("fls"))
+    assert result.status == "done"
+    assert len(result.smoothed) == len(result.online)
+
+
+def test_factor_slots_stay_bounded() -> None:
+    log = simulate(replace(TACTICAL, duration_s=100.0), seed=1)
+    run = create("fls", lag_s=3.0).begin(log.prior, log.rig)
+    for epoch in cut(log).epochs:
+        run.step(epoch)
+    assert run._smoother.getFactors().size() < 200
+
+
+def test_gtsams_refusal_is_reported_as_divergence_with_its_variable() -> None:
+    """iSAM2's Cholesky cannot solve with IMU noise of a tactical grade; QR can. Should it learn to, tell DESIGN."""
+    log = simulate(replace(TACTICAL, duration_s=20.0), seed=1)
+    result = run_log(log, create("fls", factorization="CHOLESKY"))
+    assert result.status == "diverged"
+    assert "Indeterminate linear system" in result.cause
+    assert "Symbol: " in result.cause
+    assert run_log(log, create("fls")).status == "done"
+
+
+def test_a_long_window_finds_the_optimum_of_its_whole_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything the smoother was ever given, solved by Levenberg–Marquardt: the same positions to 1 mm."""
+    log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=6)
+    run = create("fls", lag_s=100.0, relinearize=(1e-5, 1e-4, 1e-5, 1e-7)).begin(log.prior, log.rig)
+    graph, values = gtsam.NonlinearFactorGraph(run._smoother.getFactors()), run._smoother.calculateEstimate()
+    for epoch in cut(log).epochs:
+        run.step(epoch)
+    graph, values = run._smoother.getFactors(), run._smoother.calculateEstimate()
+    params = gtsam.LevenbergMarquardtParams()
+    params.setLinearSolverType("MULTIFRONTAL_QR")
+    optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    last = run._window[-1].index
+    for i in range(0, last, 7):
+        gap = optimum.atPose3(X(i)).translation() - values.atPose3(X(i)).translation()
+        assert np.linalg.norm(gap) < 1e-3
+    marginals = gtsam.Marginals(graph, optimum, gtsam.Marginals.Factorization.QR)
+    R = values.atPose3(X(last)).rotation().matrix()
+    P_pp = R @ marginals.marginalCovariance(X(last))[3:, 3:] @ R.T
+    assert np.allclose(run.belief().P[3:6, 3:6] / np.trace(P_pp), P_pp / np.trace(P_pp), atol=0.01)
+
+
+# --- our factors, against GTSAM's own numerical differentiation -------------------------------------------------------
+
+
+def _numeric(factor: gtsam.NonlinearFactor, values: gtsam.Values, key: int, kind: str) -> np.ndarray:
+    """Derivative of the whitened error by GTSAM's own retract."""
+    at = {"x": values.atPose3, "v": values.atVector, "b": values.atConstantBias}[kind](key)
+    columns = []
+    for e in np.eye(3 if kind == "v" else 6):
+        ends = []
+        for step in (1e-6 * e, -1e-6 * e):
+            moved = gtsam.Values(values)
+            if kind == "v":
+                moved.update(key, at + step)
+            elif kind == "x":
+                moved.update(key, at.retract(step))
+            else:
+                moved.update(key, gtsam.imuBias.ConstantBias(at.vector() + step))
+            ends.append(factor.whitenedError(moved))
+        columns.append((ends[0] - ends[1]) / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+def _values(rng: np.random.Generator, R_BI: np.ndarray, n: int = 2) -> gtsam.Values:
+    values = gtsam.Values()
+    for i in range(n):
+        insert_state(values, i, random_state(rng), R_BI)
+    return values
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("what", ["dvl", "depth", "gps", "heading", "attitude", "carried", "displacement", "prior"])
+def test_factor_jacobians_are_gtsams_numerical_derivatives(what: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rig = random_rig(rng)
+    record = compile_rig(rig, FACTORS, {})
+    values = _values(rng, rig.imu.R_BS)
+    kinds = {"dvl": DVL, "depth": DEPTH, "gps": GPS, "heading": HEADING, "attitude": ATTITUDE}
+    if what in kinds:
+        z = random_rotation(rng).ravel() if what == "attitude" else rng.normal(size=3)
+        factor = reading_factor(0, reading(kinds[what], z, np.full(3, 0.1)), record)
+    elif what == "carried":
+        imu, block = Path(seed).imu(0.01 * np.arange(0, 31), 0.01, rig, np.zeros(3), np.zeros(3)), np.zeros(1, BLOCK)
+        integrate(imu[1:], imu[:1], np.zeros(3), np.zeros(3), record, block)
+        at_i = as_record(Belief(0, random_state(rng), np.eye(15)))
+        factor = carried_factor(0, reading(DVL, rng.normal(size=3), np.full(3, 0.1)), block, at_i, record)
+    elif what == "displacement":
+        A = rng.normal(size=(3, 3))
+        factor = displacement_factor(0, 1, rng.normal(size=3), A @ A.T + np.eye(3))
+    else:
+        A = rng.normal(size=(15, 15))
+        factor = prior_factor(as_record(Belief(0, random_state(rng), A @ A.T + np.eye(15))), record)
+    linear = factor.linearize(values)
+    A_all, column = linear.jacobian()[0], 0
+    for key in factor.keys():
+        kind = chr(gtsam.Symbol(key).chr())
+        width = 3 if kind == "v" else 6
+        numeric = _numeric(factor, values, key, kind)
+        assert np.allclose(A_all[:, column : column + width], numeric, atol=2e-5 * max(1.0, np.abs(numeric).max()))
+        column += width
+
+
+def test_native_factors_have_our_residuals() -> None:
+    """Depth, GPS and attitude are GTSAM's own: the same error as the filter's, at random mountings."""
+    from test_measurements import residual
+
+    rng = np.random.default_rng(5)
+    rig = random_rig(rng)
+    state, values = random_state(rng), gtsam.Values()
+    insert_state(values, 0, state, rig.imu.R_BS)
+    for kind, width in ((DEPTH, 1), (GPS, 3), (ATTITUDE, 3)):
+        z = random_rotation(rng).ravel() if kind == ATTITUDE else rng.normal(size=width)
+        row = reading(kind, z, np.full(width, 0.1))
+        whitened = reading_factor(0, row, compile_rig(rig, FACTORS, {})).whitenedError(values)
+        ours = residual(row, state, rig)[0] / 0.1
+        assert np.allclose(whitened[-width:], ours, atol=1e-6)
+
+
+def test_prior_covariance_is_the_first_belief() -> None:
+    log: Log = simulate(Scenario(duration_s=20.0), seed=0)
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(15, 15))
+    scale = np.sqrt(np.diag(log.prior.P))
+    prior = replace(log.prior, P=(np.eye(15) + 0.02 * (A + A.T)) * np.outer(scale, scale))
+    run = create("fls").begin(prior, log.rig)
+    from fathom.estimators.gtsam_border import estimated_belief
+
+    belief = estimated_belief(run._smoother, 0, log.start_ns, log.rig.imu.R_BS)
+    assert np.allclose(belief.P / np.outer(scale, scale), prior.P / np.outer(scale, scale), atol=1e-6)
+    assert np.abs(prior.state.local(belief.state)).max() < 1e-9
+    assert B(0) != V(0)
+
+
+def test_diverged_is_raised_when_numbers_are_lost() -> None:
+    log = simulate(Scenario(duration_s=20.0), seed=0)
+    run = create("fls").begin(log.prior, log.rig)
+    epochs = cut(log).epochs
+    epochs[3].imu["f_I"][0] = np.nan
+    with pytest.raises(Diverged):
+        for epoch in epochs[:20]:
+            run.step(epoch)
