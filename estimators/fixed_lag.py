@@ -185,7 +185,7 @@ class FixedLagPass:
         for kind, t_ns in new:
             if self._calls_for_keyframe(kind, t_ns):
                 self._make_keyframe(t_ns)
-        if any(kind == DVL for kind, _ in new):
+        if (readings["kind"] == DVL).any():
             self._dvl_heard_ns = self._now_ns
 
     def _calls_for_keyframe(self, kind: int, t_ns: int) -> bool:
@@ -247,15 +247,16 @@ class FixedLagPass:
         stamps = {key(new.index): t_s for key in (X, V, B)}
         try:
             self._smoother.update(self._graph, values, stamps)
+            state = estimated_state(self._smoother, new.index, self._R_BI)
         except RuntimeError as error:
             raise Diverged(f"GTSAM: {explain(error)}") from None
+        if not np.isfinite(state.p_WB_W).all():
+            raise Diverged("the newest position is not finite")
         self._graph = gtsam.NonlinearFactorGraph()
+        self.counts["keyframes"] += 1
         if new.index > 0:
             self._window.append(new)
-            self._state, self._belief = estimated_state(self._smoother, new.index, self._R_BI), None
-            if not np.isfinite(self._state.p_WB_W).all():
-                raise Diverged("the newest position is not finite")
-        self.counts["keyframes"] += 1
+            self._state, self._belief = state, None
 
     # --- factors -----------------------------------------------------------------------------------------------------
 

@@ -19,8 +19,9 @@ from scipy.stats import chi2
 
 
 def drive(log: Log, name: str = "eskf", **options: object) -> Belief:
+    """The belief at the log's end."""
     run = create(name, **options).begin(log.prior, log.rig)
-    for epoch in cut(log, sensors=create(name, **options).factors).epochs:
+    for epoch in cut(log, log.imu.t_ns[-1:], create(name, **options).factors).epochs:
         run.step(epoch)
     return run.belief()
 
