@@ -210,7 +210,7 @@ def _drive(run: Pass, voyage: Voyage, tape: Tape, limit_ns: float) -> Ending:
             step(epoch)
             ended = clock()
             step_ns(ended - started)
-            if False:
+            if ended > limit_ns:
                 return Ending("failed", "out of time", t_ns)
             if epoch.tick:
                 started = clock()

@@ -59,9 +59,12 @@ class Store:
     """
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self.connection = sqlite3.connect(path, timeout=60)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self.connection = sqlite3.connect(path, timeout=60)
+        except (OSError, sqlite3.Error) as error:
+            raise ExperimentError(f"{path}: cannot be written ({error}); give another --out") from None
         try:
             self._prepare()
         except sqlite3.Error as error:

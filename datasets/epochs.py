@@ -137,7 +137,9 @@ def _imu_table(log: Log, times: TimeArray, start_ns: int, end_ns: int) -> NDArra
     """Return the samples after start_ns as IMU_SAMPLE rows, split at `times`."""
     imu = log.imu
     own = imu.t_ns[(imu.t_ns > start_ns) & (imu.t_ns <= end_ns)]
-    t_ns = np.union1d(own, times[times <= end_ns])
+    times = times[(times > start_ns) & (times <= end_ns)]
+    between = times[own[np.searchsorted(own, times)] != times]
+    t_ns = np.insert(own, np.searchsorted(own, between), between) if len(between) else own
     source = np.searchsorted(imu.t_ns, t_ns)
     interval = np.diff(imu.t_ns, prepend=imu.t_ns[0] - imu.period_ns)
     table = np.zeros(len(t_ns), IMU_SAMPLE)

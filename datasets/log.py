@@ -144,7 +144,9 @@ class AttitudeStream(ReadingStream):
         R = self.z.reshape(-1, 3, 3)
         bad = np.flatnonzero(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
         if len(bad):
-            raise DatasetError(f"attitude: row {bad[0]} ({len(bad)} in all) is not a rotation; --repair drops such rows")
+            raise DatasetError(
+                f"attitude: row {bad[0]} ({len(bad)} in all) is not a rotation; --repair drops such rows"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
@@ -54,7 +55,7 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def select(self, rows: Array | TimeArray | slice) -> Trajectory:
+    def select(self, rows: NDArray[np.bool_] | TimeArray | slice) -> Trajectory:
         """Return the rows given by a mask, indices or a slice."""
 
         def pick(values: Array | None) -> Array | None:
@@ -131,7 +132,9 @@ class Trajectory:
                 raise DatasetError(f"{path}: line {number}: expected t x y z qx qy qz qw, found {len(fields)} fields")
             length = float(np.linalg.norm(rows[-1][3:]))
             if not (np.isfinite(rows[-1]).all() and abs(length - 1) < 1e-3):
-                raise DatasetError(f"{path}: line {number}: not a finite pose with a unit quaternion (|q| = {length:.6g})")
+                raise DatasetError(
+                    f"{path}: line {number}: not a finite pose with a unit quaternion (|q| = {length:.6g})"
+                )
         if not rows:
             raise DatasetError(f"{path}: no poses; expected lines of t x y z qx qy qz qw")
         values = np.array(rows)

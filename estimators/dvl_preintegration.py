@@ -23,7 +23,14 @@ from .so3 import exp, product, transform
 
 @njit(cache=True)
 def preintegrate_dvl(
-    imu: NDArray[Any], start_ns: int, t_ns: TimeArray, v_WB_B: Array, sigma: Array, b_g: Array, rig: NDArray[Any], straight: bool
+    imu: NDArray[Any],
+    start_ns: int,
+    t_ns: TimeArray,
+    v_WB_B: Array,
+    sigma: Array,
+    b_g: Array,
+    rig: NDArray[Any],
+    straight: bool,
 ) -> tuple[Array, Array]:
     """Sum DVL velocities over a block of IMU samples.
 

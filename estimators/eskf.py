@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import SENSOR, Epoch
+from ..datasets.epochs import Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import THETA, Array, Belief
 from ..datasets.trajectory import Trajectory
-from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
+from .imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise, sandwich
 from .interface import FACTORS, Diverged
 from .measurements import measure
 from .records import as_belief, as_record, split, with_rate_noise
@@ -73,7 +73,8 @@ class ErrorStatePass:
 
     def step(self, epoch: Epoch) -> None:
         """See `Pass.step`."""
-        if len(epoch.readings) and epoch.readings["t_ns"].min() < epoch.t_ns - self._config.merge_ns:
+        # an epoch's readings stand in the order of their truth
+        if len(epoch.readings) and epoch.readings["t_ns"][0] < epoch.t_ns - self._config.merge_ns:
             epoch = self._go_back_for_late(epoch)
         self._live(epoch)
 
@@ -105,7 +106,10 @@ class ErrorStatePass:
         is_late = epoch.readings["t_ns"] < epoch.t_ns - self._config.merge_ns
         late = epoch.readings[is_late]
         late = late[np.argsort(late["t_ns"], kind="stable")]
-        past = [*self._past, Lived(epoch._replace(readings=epoch.readings[~is_late]), self._state, self._before_or(epoch))]
+        past = [
+            *self._past,
+            Lived(epoch._replace(readings=epoch.readings[~is_late]), self._state, self._before_or(epoch)),
+        ]
         began_ns = past[0].epoch.t_ns - round(float(past[0].epoch.imu["dt_s"].sum()) * 1e9)
         reachable = late[late["t_ns"] > began_ns]
         self.counts["late"] += len(late) - len(reachable)
@@ -143,8 +147,13 @@ def _insert(epochs: list[Epoch], reading: Any) -> list[Epoch]:
 
 @njit(cache=True)
 def filter_step(
-    state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], readings: NDArray[Any], block: NDArray[Any]
-) -> bool:  # fmt: skip
+    state: NDArray[Any],
+    rig: NDArray[Any],
+    before: NDArray[Any],
+    imu: NDArray[Any],
+    readings: NDArray[Any],
+    block: NDArray[Any],
+) -> bool:
     """One epoch of the filter, in place on `state`; False where it diverged."""
     if len(imu) > 0:
         propagate(state, rig, before, imu, block)

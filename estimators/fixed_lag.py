@@ -244,7 +244,7 @@ class FixedLagPass:
         while self._window and self._window[0].t_ns < horizon_ns and self._window[0] is not new:
             leaving.append(self._window.popleft())
         self._leave(leaving)
-        stamps = {key(new.index): t_s for key in (X, V, B)}
+        stamps: dict[Any, Any] = {key(new.index): t_s for key in (X, V, B)}
         try:
             self._smoother.update(self._graph, values, stamps)
             state = estimated_state(self._smoother, new.index, self._R_BI)

@@ -133,9 +133,15 @@ def _by_gtsam(H: Array, R_WB: Array, R_BI: Array) -> tuple[Array, Array, Array]:
 
 @njit(cache=True)
 def _linearise(
-    reading: NDArray[Any], block: NDArray[Any], carried: bool, pose: Array, v_WB_W: Array, bias: Array, rig: NDArray[Any]
+    reading: NDArray[Any],
+    block: NDArray[Any],
+    carried: bool,
+    pose: Array,
+    v_WB_W: Array,
+    bias: Array,
+    rig: NDArray[Any],
 ) -> tuple[Array, Array, Array, Array]:
-    """Residual of a reading and its Jacobians by pose, velocity and bias of the keyframe; carried over `block` first."""
+    """Residual of a reading, carried over `block` first, and its Jacobians by the pose, velocity and bias of i."""
     state = _as_state(pose, v_WB_W, bias, rig[0].R_BI)
     r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
     if carried:
@@ -313,5 +319,3 @@ def explain(error: RuntimeError) -> str:
     """Return what GTSAM says, on one line, its keys by name."""
     text = " ".join(str(error).split())
     return re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), text)[:300]
-
-

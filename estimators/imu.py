@@ -5,14 +5,14 @@ and sculling corrections, and moves it to B at the two ends:
 
     Δv_B = Δv_I + ω_i × l − ΔR (ω_j × l)        Δp_B = Δp_I + (ω_i × l) T + l − ΔR l
 
-Term by term this is what the centripetal and the tangential acceleration of I add up to, the gyro being differenced for
-the latter: the difference telescopes, so only the rates ω_i and ω_j at the ends are left. Each is the mean over the last
-sample before its moment, so v_B lags by half a sample's turn of l, which does not accumulate.
+Term by term this is what the centripetal and the tangential acceleration of I add up to, the gyro being differenced
+for the latter: the difference telescopes, so only the rates ω_i and ω_j at the ends are left. Each is the mean over the
+last sample before its moment, so v_B lags by half a sample's turn of l, which does not accumulate.
 
-Nor does their noise, one gyro sample each: ω_i's leaves with the block what it came with, as part of v_B at i, and ω_j's
-is fresh. A covariance that took both as process noise would grow with every block, however short. So neither is in N:
-P is of v_B but for the rate noise of the moment, `rate_cov`, which is added where v_B is compared with a reading of it
-and where a belief is handed out. (A single block's Δv, taken alone, has it twice.)
+Nor does their noise, one gyro sample each: ω_i's leaves with the block what it came with, as part of v_B at i, and
+ω_j's is fresh. A covariance that took both as process noise would grow with every block, however short. So neither is
+in N: P is of v_B but for the rate noise of the moment, `rate_cov`, which is added where v_B is compared with a reading
+of it and where a belief is handed out. (A single block's Δv, taken alone, has it twice.)
 
 Increments are free of gravity (Forster et al. 2017, doi:10.1109/TRO.2016.2597321, eq. 33) and in the axes of B at the
 block's start, i:
@@ -116,7 +116,7 @@ def integrate(
             is (walk T / density)²/3 of it, less than 1e-3 for any IMU of note at T = 1 s.
     """
     g, block, n = rig[0], out[0], len(imu)
-    l = g.p_BI_B
+    arm = g.p_BI_B
     R_mid, v_mid, p_mid = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))  # at the middle of each sample
     R, half, turn, push, drift = np.eye(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     v, p, w_x_f, T = np.zeros(3), np.zeros(3), np.empty(3), 0.0
@@ -147,11 +147,11 @@ def integrate(
         product_into(R_mid[k], half, R)
         T += dt
 
-    c_i, c_j = cross(rates[0], l), cross(rates[n], l)
-    v_end, p_end = v - transform(R, c_j), p - transform(R, l)
+    c_i, c_j = cross(rates[0], arm), cross(rates[n], arm)
+    v_end, p_end = v - transform(R, c_j), p - transform(R, arm)
     block.T, block.dR[:], block.b_a[:], block.b_g[:] = T, R, b_a, b_g
     block.dv[:] = v_end + c_i
-    block.dp[:] = p_end + T * c_i + l
+    block.dp[:] = p_end + T * c_i + arm
     _spread(imu, R_mid, v_mid, p_mid, v_end, p_end, rig, out)
 
 
@@ -159,7 +159,7 @@ def integrate(
 def unbiased(
     imu: NDArray[Any], before: NDArray[Any], b_a: Array, b_g: Array, R_BI: Array
 ) -> tuple[Array, Array, Array]:
-    """Return rates (n + 1, 3) and specific forces in B axes without their biases, and durations; `before` comes first."""
+    """Return rates and forces (n + 1, 3) in B axes without their biases, and durations; `before` comes first."""
     n = len(imu)
     rates, forces, dts = np.empty((n + 1, 3)), np.empty((n + 1, 3)), np.empty(n + 1)
     for k in range(n + 1):

@@ -13,7 +13,7 @@ FACTORS = frozenset({"depth", "gps", "heading", "dvl"})
 """The aiding sensors that an estimator may be allowed."""
 
 
-class Diverged(RuntimeError):
+class Diverged(RuntimeError):  # noqa: N818 - the run's status, by its name
     """The estimator cannot go on: numbers that are not finite, a covariance that is none, a solver that gave up.
 
     The run is recorded as diverged, with this message as its cause.

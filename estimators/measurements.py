@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
@@ -86,9 +85,7 @@ def dvl_residual(R_WB: Array, v_WB_W: Array, v_WB_B: Array, H: Array) -> Array:
 
 
 @njit(cache=True)
-def preintegrated_dvl_residual(
-    R_i: Array, p_i: Array, p_j: Array, dp_ij: Array, H_i: Array, H_j: Array
-) -> Array:
+def preintegrated_dvl_residual(R_i: Array, p_i: Array, p_j: Array, dp_ij: Array, H_i: Array, H_j: Array) -> Array:
     """r(x_i, x_j) = R_iᵀ (p_j − p_i) − Δp̃_ij                                       [eq. 6]
 
     Returns r (3,) m and fills H_i and H_j, both (3, 15).

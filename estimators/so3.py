@@ -1,7 +1,7 @@
 """Rotations: skew, exponential, logarithm and Jacobians of SO(3), compiled.
 
-Source: Solà, Deray & Atchuthan 2018, arXiv:1812.01537, appendix B. Where an angle is small, coefficients come from their
-series.
+Source: Solà, Deray & Atchuthan 2018, arXiv:1812.01537, appendix B. Where an angle is small, coefficients come from
+their series.
 """
 
 from __future__ import annotations
@@ -140,7 +140,9 @@ def right_jacobian(phi: Array) -> Array:
     out = np.empty((3, 3))
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     if angle2 < 1e-4:  # the closed form would lose digits by cancellation
-        _polynomial(phi, 1.0, -0.5 + angle2 / 24.0 - angle2**2 / 720.0, 1.0 / 6.0 - angle2 / 120.0 + angle2**2 / 5040.0, out)
+        _polynomial(
+            phi, 1.0, -0.5 + angle2 / 24.0 - angle2**2 / 720.0, 1.0 / 6.0 - angle2 / 120.0 + angle2**2 / 5040.0, out
+        )
     else:
         angle = math.sqrt(angle2)
         _polynomial(phi, 1.0, -(1.0 - math.cos(angle)) / angle2, (angle - math.sin(angle)) / (angle2 * angle), out)

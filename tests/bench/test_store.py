@@ -85,6 +85,12 @@ def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path: Path) -> No
         load_runs(tmp_path / "elsewhere")
 
 
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file, not a folder")
+    with pytest.raises(ExperimentError, match="cannot be written"):
+        Store(tmp_path / "out" / "e" / "runs.sqlite")
+
+
 def test_provenance_names_commit_versions_and_machine() -> None:
     assert set(provenance()) == {"commit_id", "versions", "machine"}
     assert set(provenance()) <= set(COLUMNS)

@@ -26,10 +26,10 @@ def voyage(seed: int, *, noisy: bool, rate_hz: int = 50) -> tuple[Log, NavState,
     roll, pitch, speed = rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(0.0, 1.5)
     psi0, turn = rng.uniform(-3, 3), rng.uniform(-0.2, 0.2)
 
-    def R_WB(time: float) -> np.ndarray:  # noqa: N802
+    def R_WB(time: float) -> np.ndarray:
         return Rotation.from_euler("ZYX", [psi0 + turn * time, pitch, roll]).as_matrix()
 
-    def v_W(time: float) -> np.ndarray:  # noqa: N802
+    def v_W(time: float) -> np.ndarray:
         return speed * np.array([np.cos(psi0 + turn * time), np.sin(psi0 + turn * time), 0.0])
 
     mountings = {
@@ -58,7 +58,7 @@ def voyage(seed: int, *, noisy: bool, rate_hz: int = 50) -> tuple[Log, NavState,
             z = z + rng.normal(size=z.shape) * sigma
         return kind(stamps(times), stamps(times), z, sigmas)
 
-    def p_W(time: float) -> np.ndarray:  # noqa: N802
+    def p_W(time: float) -> np.ndarray:
         steps = np.linspace(0, time, 201)
         p = np.trapezoid([v_W(s) for s in steps], steps, axis=0)
         return np.add(p, [0, 0, -4.0])

@@ -27,7 +27,11 @@ def random_rig(rng: np.random.Generator, lever_m: float = 0.5, noise: ImuNoise =
 
 def random_state(rng: np.random.Generator) -> NavState:
     return NavState(
-        random_rotation(rng), rng.normal(size=3) * 20, rng.normal(size=3), rng.normal(size=3) * 0.02, rng.normal(size=3) * 0.002
+        random_rotation(rng),
+        rng.normal(size=3) * 20,
+        rng.normal(size=3),
+        rng.normal(size=3) * 0.02,
+        rng.normal(size=3) * 0.002,
     )
 
 

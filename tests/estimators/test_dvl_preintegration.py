@@ -40,7 +40,7 @@ def test_a_fast_dvl_gives_the_true_displacement(seed: int) -> None:
 
 
 def test_turning_at_imu_rate_beats_turning_at_dvl_rate() -> None:
-    """A noise-free second at 5 Hz with a velocity that is constant in B: exact for us, millimetres for the plain sum."""
+    """A noise-free second at 5 Hz, the velocity constant in B: exact for us, a centimetre off for the plain sum."""
     rig = Rig(ImuNoise(1e-4, 1e-3, 1e-6, 1e-5, 1e-4, 1e-2))
     w, v_WB_B = np.array([0.0, 0.0, 0.3]), np.array([1.5, 0.0, 0.0])
     imu = Path(0).imu(DT * np.arange(1, 101), DT, rig, np.zeros(3), np.zeros(3))

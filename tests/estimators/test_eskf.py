@@ -81,7 +81,10 @@ def test_a_late_reading_is_worth_what_it_would_have_been_in_time(delay_s: float)
     """The same log, once with everything in time and once with DVL, GPS and heading late: the same end."""
     scenario = Scenario(duration_s=40.0)
     late = replace(
-        scenario, dvl=DvlSpec(delay_s=delay_s), gps=GpsSpec(delay_s=delay_s / 2), heading=HeadingSpec(delay_s=delay_s / 3)
+        scenario,
+        dvl=DvlSpec(delay_s=delay_s),
+        gps=GpsSpec(delay_s=delay_s / 2),
+        heading=HeadingSpec(delay_s=delay_s / 3),
     )
     in_time, delayed = simulate(scenario, seed=5), simulate(late, seed=5)
     last = int(delayed.imu.t_ns[-1] - delay_s * 1e9)

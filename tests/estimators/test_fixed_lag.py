@@ -10,18 +10,29 @@ import pytest
 from fathom.bench.metrics import ate
 from fathom.bench.run import run_log
 from fathom.datasets import Belief, Log, Trajectory
+from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, Epoch, cut
 from fathom.datasets.log import ReadingStream
-from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, cut
 from fathom.datasets.scenario import DvlSpec, GpsSpec, HeadingSpec, Scenario
 from fathom.datasets.simulator import simulate
-from fathom.estimators import FACTORS, Diverged, create
-from fathom.estimators.gtsam_border import carried_factor, displacement_factor, insert_state, prior_factor, reading_factor
+from fathom.estimators import FACTORS, Diverged, Pass, create
+from fathom.estimators.gtsam_border import (
+    carried_factor,
+    displacement_factor,
+    insert_state,
+    prior_factor,
+    reading_factor,
+)
 from fathom.estimators.imu import BLOCK, compile_rig, integrate
 from fathom.estimators.records import as_record
 from gtsam.symbol_shorthand import B, V, X
 from paths import Path, random_rig, random_rotation, random_state, reading
 
 TACTICAL = Scenario(duration_s=120.0, imu="tactical")
+
+
+def _drive(run: Pass, epochs: list[Epoch]) -> None:
+    for epoch in epochs:
+        run.step(epoch)
 
 
 def position_gap_in_sigma(a: Trajectory, b: Trajectory, after_s: float) -> np.ndarray:
@@ -151,8 +162,7 @@ def test_imu_alone_runs() -> None:
 def test_factor_slots_stay_bounded() -> None:
     log = simulate(replace(TACTICAL, duration_s=100.0), seed=1)
     run = create("fls", lag_s=3.0).begin(log.prior, log.rig)
-    for epoch in cut(log).epochs:
-        run.step(epoch)
+    _drive(run, cut(log).epochs)
     assert run._smoother.getFactors().size() < 200
 
 
@@ -170,8 +180,7 @@ def test_a_long_window_finds_the_optimum_of_its_whole_graph() -> None:
     """Everything the smoother was ever given, solved by Levenberg–Marquardt: the same positions to 1 mm."""
     log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=6)
     run = create("fls", lag_s=100.0, relinearize=(1e-5, 1e-4, 1e-5, 1e-7)).begin(log.prior, log.rig)
-    for epoch in cut(log).epochs:
-        run.step(epoch)
+    _drive(run, cut(log).epochs)
     graph, values = run._smoother.getFactors(), run._smoother.calculateEstimate()
     params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType("MULTIFRONTAL_QR")
@@ -243,7 +252,7 @@ def test_factor_jacobians_are_gtsams_numerical_derivatives(what: str, seed: int)
         factor = prior_factor(as_record(Belief(0, random_state(rng), A @ A.T + np.eye(15))), record)
     linear = factor.linearize(values)
     A_all, column = linear.jacobian()[0], 0
-    for key in factor.keys():
+    for key in factor.keys():  # noqa: SIM118 - a factor is no dict
         kind = chr(gtsam.Symbol(key).chr())
         width = 3 if kind == "v" else 6
         numeric = _numeric(factor, values, key, kind)
@@ -288,5 +297,4 @@ def test_diverged_is_raised_when_numbers_are_lost() -> None:
     epochs = cut(log).epochs
     epochs[3].imu["f_I"][0] = np.nan
     with pytest.raises(Diverged):
-        for epoch in epochs[:20]:
-            run.step(epoch)
+        _drive(run, epochs[:20])

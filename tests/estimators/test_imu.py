@@ -35,7 +35,9 @@ def test_block_follows_a_path_at_a_lever_arm(seed: int) -> None:
     b_a, b_g = rng.normal(size=3) * 0.05, rng.normal(size=3) * 0.01
     t = dt * np.arange(0, 1001)
     imu = path.imu(t, dt, rig, b_a, b_g)
-    state, truth = (_with_late_rate(path.state(at, b_a, b_g), path, at, imu[k], rig) for at, k in ((0.0, 0), (10.0, -1)))
+    state, truth = (
+        _with_late_rate(path.state(at, b_a, b_g), path, at, imu[k], rig) for at, k in ((0.0, 0), (10.0, -1))
+    )
     for k in range(1, 1001, 20):
         state = carry(state, imu[k : k + 20], imu[k - 1 : k], rig)
     error = truth.local(state)
@@ -45,7 +47,7 @@ def test_block_follows_a_path_at_a_lever_arm(seed: int) -> None:
 
 
 def _with_late_rate(state: NavState, path: Path, t_s: float, sample: np.ndarray, rig: Rig) -> NavState:
-    """The velocity of B by way of the IMU's, with the mean rate of the last sample: half a sample late, as documented."""
+    """The velocity of B by way of the IMU's, with the mean rate of the last sample: half a sample late, as we say."""
     late = rig.imu.R_BS @ (sample["w_WI_I"] - state.b_g) - path.rate(np.array([t_s]))[0]
     return replace(state, v_WB_W=state.v_WB_W - state.R_WB @ np.cross(late, rig.imu.p_BS_B))
 
@@ -123,10 +125,9 @@ def test_gtsam_preintegrates_exactly_our_block(seed: int) -> None:
     assert np.allclose(theirs.deltaPij(), block["dp"][0], atol=1e-13)
 
 
-
 @pytest.mark.parametrize("seed", range(3))
 def test_our_covariance_of_a_block_is_gtsams(seed: int) -> None:
-    """Without a lever arm: with one, gyro noise moves B by turning it, which GTSAM, fed with B's samples, cannot know."""
+    """Without a lever arm: with one, gyro noise moves B by turning it; GTSAM, fed with B's samples, cannot know."""
     rng = np.random.default_rng(seed)
     rig, path, dt = random_rig(rng, lever_m=0.0), Path(seed), 0.01
     imu = path.imu(dt * np.arange(0, 31), dt, rig, np.zeros(3), np.zeros(3))
@@ -187,7 +188,9 @@ def test_block_without_samples_moves_nothing() -> None:
     path, rig = Path(0), random_rig(np.random.default_rng(0))
     state = path.state(0.0, np.zeros(3), np.zeros(3))
     none = np.zeros(0, IMU_SAMPLE)
-    assert np.abs(state.local(carry(state, none, path.imu(np.zeros(1), 0.01, rig, *np.zeros((2, 3))), rig))).max() < 1e-12
+    assert (
+        np.abs(state.local(carry(state, none, path.imu(np.zeros(1), 0.01, rig, *np.zeros((2, 3))), rig))).max() < 1e-12
+    )
 
 
 def test_process_noise_is_symmetric_and_sandwich_is_f_p_f_transposed() -> None:

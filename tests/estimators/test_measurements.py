@@ -19,7 +19,9 @@ from scipy.spatial.transform import Rotation
 KINDS = {"dvl": DVL, "depth": DEPTH, "gps": GPS, "heading": HEADING, "attitude": ATTITUDE}
 
 
-def residual(row: np.ndarray, state: NavState, rig: Rig, inflate: dict[str, float] | None = None) -> tuple[np.ndarray, ...]:
+def residual(
+    row: np.ndarray, state: NavState, rig: Rig, inflate: dict[str, float] | None = None
+) -> tuple[np.ndarray, ...]:
     r, H, C = np.zeros(3), np.zeros((3, 15)), np.zeros((3, 3))
     record = as_record(Belief(0, state, np.zeros((15, 15))))
     n = measure(row, 0, record, compile_rig(rig, FACTORS, inflate or {}), r, H, C)

@@ -39,7 +39,10 @@ def test_right_jacobian_is_the_derivative_of_exp(angle: float) -> None:
     step = 1e-6
     for phi in _vectors(angle):
         numeric = np.stack(
-            [(log(exp(phi).T @ exp(phi + step * e)) - log(exp(phi).T @ exp(phi - step * e))) / (2 * step) for e in np.eye(3)],
+            [
+                (log(exp(phi).T @ exp(phi + step * e)) - log(exp(phi).T @ exp(phi - step * e))) / (2 * step)
+                for e in np.eye(3)
+            ],
             axis=1,
         )
         assert np.allclose(right_jacobian(phi), numeric, atol=1e-9)

@@ -1,0 +1,34 @@
+# Two commands set everything up: `make bench` and `make test`. FATHOM_DATA names the folder of recordings.
+
+PYTHON ?= python3
+DATA := $(firstword $(FATHOM_DATA) $(wildcard ../shared/data))
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: bench test lint clean
+
+bench: .venv/core
+	$(BIN)/fathom run filter_vs_smoother $(if $(DATA),--data $(DATA))
+
+test: .venv/dev lint
+	$(BIN)/python -m pytest -q
+
+# basedpyright cannot follow an editable install, so it sees a plain one
+lint: .venv/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	rm -rf build
+	$(PIP) --no-deps --target build/types .
+	$(BIN)/basedpyright
+
+.venv/core: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(PIP) --editable .
+	touch $@
+
+.venv/dev: .venv/core
+	$(PIP) --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv build *.egg-info
