@@ -14,7 +14,7 @@ from ..datasets.state import Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
 from .dvl_preintegration import preintegrate_dvl
 from .imu import compile_rig
-from .interface import FACTORS
+from .interface import FACTORS, Factors
 from .so3 import exp
 
 
@@ -29,7 +29,7 @@ class DeadReckoning:
     """
 
     attitude: Literal["gyro", "heading"] = "heading"
-    factors: frozenset[str] = FACTORS
+    factors: Factors = FACTORS
 
     def begin(self, prior: Belief, rig: Rig) -> DeadReckoningPass:
         """See `Estimator.begin`."""

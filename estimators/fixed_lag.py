@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
@@ -36,10 +36,11 @@ from .gtsam_border import (
     reading_factor,
 )
 from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
-from .interface import FACTORS, Diverged
+from .interface import FACTORS, Diverged, Factors, Inflation
 from .records import as_belief, as_record, split, with_rate_noise
 
 DvlFactor = Literal["velocity", "preintegrated-loose"]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -68,18 +69,18 @@ class FixedLagSmoother:
         hindsight_covariance_s: period at which states that leave the window keep their covariance.
     """
 
-    lag_s: float = Field(default=3.0, gt=0)
-    dvl: frozenset[DvlFactor] = frozenset({"velocity"})
+    lag_s: Positive = 3.0
+    dvl: Annotated[frozenset[DvlFactor], Field(min_length=1)] = frozenset({"velocity"})
     dvl_between: Literal["held", "straight"] = "held"
-    keyframe_period_s: float | None = Field(default=None, gt=0)
-    keyframe_timeout_s: float = Field(default=0.5, gt=0)
-    max_hold_s: float = Field(default=1.5, gt=0)
+    keyframe_period_s: Positive | None = None
+    keyframe_timeout_s: Positive = 0.5
+    max_hold_s: Positive = 1.5
     merge_ns: int = Field(default=5_000_000, ge=0)
-    factors: frozenset[str] = FACTORS
-    inflate: dict[str, float] = Field(default_factory=dict)
+    factors: Factors = FACTORS
+    inflate: Inflation = Field(default_factory=dict)
     factorization: Literal["QR", "CHOLESKY"] = "QR"
-    relinearize: tuple[float, float, float, float] = (0.005, 1e3, 0.05, 1.0)
-    hindsight_covariance_s: float = Field(default=5.0, gt=0)
+    relinearize: tuple[Positive, Positive, Positive, Positive] = (0.005, 1e3, 0.05, 1.0)
+    hindsight_covariance_s: Positive = 5.0
 
     @property
     def preintegrates(self) -> bool:

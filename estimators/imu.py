@@ -333,7 +333,7 @@ def sandwich(F: Array, P: Array) -> Array:
 
 
 def first_sample(imu: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
-    """Return the row to stand before a log's first block: its first sample, as if the motion had been the same.
+    """Return the row to stand before a log's first block: its first two samples, run straight on to its beginning.
 
     Also settles the rig's rate_cov, now that the IMU's period is known.
     """
@@ -341,4 +341,8 @@ def first_sample(imu: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
         return np.zeros(1, IMU_SAMPLE)
     L = skew(rig["p_BI_B"][0])
     rig["rate_cov"] = rig["gyro_density"][0] ** 2 / imu["dt_s"].max() * (L @ L.T)
-    return imu[:1].copy()
+    row = imu[:1].copy()
+    if len(imu) > 1:
+        for name in ("w_WI_I", "f_I"):
+            row[name] = 1.5 * imu[name][0] - 0.5 * imu[name][1]
+    return row

@@ -2,15 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Collection
+from typing import Annotated, Protocol, runtime_checkable
+
+from pydantic import AfterValidator, Field
 
 from ..datasets.epochs import Epoch
+from ..datasets.errors import nearest
 from ..datasets.rig import Rig
 from ..datasets.state import Belief
 from ..datasets.trajectory import Trajectory
 
 FACTORS = frozenset({"depth", "gps", "heading", "dvl"})
 """The aiding sensors that an estimator may be allowed."""
+
+
+def _known(names: Collection[str], known: frozenset[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"no sensor {name!r}{nearest(name, known)} (known: {', '.join(sorted(known))})")
+
+
+def _factors(names: frozenset[str]) -> frozenset[str]:
+    _known(names, FACTORS)
+    return names
+
+
+def _inflate(factor_by_sensor: dict[str, float]) -> dict[str, float]:
+    _known(factor_by_sensor, FACTORS | {"gyro", "accel"})
+    return factor_by_sensor
+
+
+Factors = Annotated[frozenset[str], AfterValidator(_factors)]
+"""Which aiding sensors an estimator may use."""
+Inflation = Annotated[dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]], AfterValidator(_inflate)]
+"""Factor on the stated sigma by sensor; also "gyro" and "accel"."""
 
 
 class Diverged(RuntimeError):  # noqa: N818 - the run's status, by its name
