@@ -33,6 +33,7 @@ SHOWN = {
     "rpe_rmse_m": "RPE\nm",
     "anees_position": "NEES\n/3",
     "step_median_us": "step\nmedian",
+    "step_p99_us": "\np99",
     "real_time_factor": "× real\ntime",
 }
 ABSENT = "–"
@@ -156,7 +157,7 @@ def _cell(name: str, value: float | None) -> str:
         return ABSENT
     if name == "anees_position":
         return _three_figures(value / 3)
-    if name == "step_median_us":
+    if name in ("step_median_us", "step_p99_us"):
         return f"{_three_figures(value)} µs" if value < 1000 else f"{_three_figures(value / 1000)} ms"
     return _three_figures(value)
 
