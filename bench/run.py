@@ -165,6 +165,8 @@ def run_log(
         tape = Tape(sum(epoch.tick for epoch in voyage.epochs))
         try:
             run = estimator.begin(log.prior, log.rig)
+        except Diverged as error:
+            ending = Ending("diverged", str(error), voyage.start_ns)
         except Exception as error:
             ending = Ending("failed", _describe(error), voyage.start_ns)
         else:

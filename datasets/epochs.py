@@ -21,7 +21,8 @@ IMU_SAMPLE = np.dtype(
     [
         ("t_ns", "i8"),  # end of the interval
         ("dt_s", "f8"),  # its length
-        ("held_s", "f8"),  # how much of it bridges a gap, the sample being held
+        ("held_s", "f8"),  # length of the gap that it is part of, over which the sample before is held; else 0
+        ("period_s", "f8"),  # what the IMU averages over, whatever it was split into
         ("w_WI_I", "f8", (3,)),
         ("f_I", "f8", (3,)),
     ]
@@ -56,7 +57,8 @@ class Voyage:
     Attributes:
         epochs: in the order of reception.
         start_ns: where the first IMU block begins.
-        counts: how many IMU gaps were bridged and how many readings lay outside the IMU's time.
+        counts: how many IMU gaps were bridged, how many readings lay outside the IMU's time, and how many measured
+            nothing (every sigma infinite).
         failure: why the voyage ends early, with the time, or None.
     """
 
@@ -103,7 +105,9 @@ def cut(
 
     readings = reading_table(log, sensors)
     inside = (readings["t_ns"] > start_ns) & (readings["received_ns"] <= end_ns)
-    outside, readings = int(np.count_nonzero(~inside)), readings[inside]
+    void = inside & ~np.isfinite(readings["sigma"]).any(axis=1)
+    counts = {"imu_gaps_bridged": gaps, "readings_outside": int((~inside).sum()), "readings_void": int(void.sum())}
+    readings = readings[inside & ~void]
     ticks = np.zeros(0, np.int64) if ticks_ns is None else ticks_ns[(ticks_ns > start_ns) & (ticks_ns <= end_ns)]
 
     times = np.union1d(readings["received_ns"], ticks)
@@ -116,35 +120,50 @@ def cut(
     for t_ns, i_stop, r_stop, tick in zip(times.tolist(), imu_stop, reading_stop, is_tick, strict=True):
         epochs.append(Epoch(t_ns, samples[i:i_stop], readings[r:r_stop], tick))
         i, r = i_stop, r_stop
-    return Voyage(epochs, start_ns, {"imu_gaps_bridged": gaps, "readings_outside": outside}, failure)
+    return Voyage(epochs, start_ns, counts, failure)
 
 
 def _first_long_gap(log: Log, start_ns: int, end_ns: int, max_gap_s: float) -> tuple[str | None, int, int]:
     """Return (failure, end of the usable IMU data, gaps bridged before it)."""
-    t_ns = log.imu.t_ns
-    step = np.diff(t_ns)
-    after = t_ns[1:] > start_ns
+    t_ns, step = log.imu.t_ns, _intervals(log, start_ns)
+    after = t_ns > start_ns
     long = np.flatnonzero(after & (step > max_gap_s * 1e9))
     failure = None
     if len(long):
-        end_ns = int(t_ns[long[0]])
+        end_ns = int(t_ns[long[0]] - step[long[0]])
         failure = f"imu gap at {(end_ns - start_ns) * 1e-9:.3f} s: {step[long[0]] * 1e-9:.3f} s without a sample"
-    bridged = after & (t_ns[1:] <= end_ns) & (step > GAP_FACTOR * log.imu.period_ns)
+    bridged = after & (t_ns <= end_ns) & (step > GAP_FACTOR * log.imu.period_ns)
     return failure, end_ns, int(np.count_nonzero(bridged))
 
 
+def _intervals(log: Log, start_ns: int) -> TimeArray:
+    """Return how long nothing had been heard of the IMU at each of its samples, (n,) ns."""
+    first = int(log.imu.t_ns[0])
+    return np.diff(log.imu.t_ns, prepend=min(start_ns, first - log.imu.period_ns))
+
+
 def _imu_table(log: Log, times: TimeArray, start_ns: int, end_ns: int) -> NDArray[Any]:
-    """Return the samples after start_ns as IMU_SAMPLE rows, split at `times`."""
-    imu = log.imu
+    """Return the samples after start_ns as IMU_SAMPLE rows, split at `times`.
+
+    In a gap the sample before is held, up to one period before the next: no row knows of a later sample than its own.
+    """
+    imu, period_ns = log.imu, log.imu.period_ns
+    interval = _intervals(log, start_ns)
+    is_gap = interval > GAP_FACTOR * period_ns
+    edges = np.union1d(times, imu.t_ns[is_gap] - period_ns)
+    edges = edges[(edges > start_ns) & (edges <= end_ns)]
     own = imu.t_ns[(imu.t_ns > start_ns) & (imu.t_ns <= end_ns)]
-    times = times[(times > start_ns) & (times <= end_ns)]
-    between = times[own[np.searchsorted(own, times)] != times]
+    if not len(own):
+        return np.zeros(0, IMU_SAMPLE)
+    between = edges[own[np.minimum(np.searchsorted(own, edges), len(own) - 1)] != edges]
     t_ns = np.insert(own, np.searchsorted(own, between), between) if len(between) else own
+
     source = np.searchsorted(imu.t_ns, t_ns)
-    interval = np.diff(imu.t_ns, prepend=imu.t_ns[0] - imu.period_ns)
+    held = is_gap[source] & (t_ns <= imu.t_ns[source] - period_ns)
     table = np.zeros(len(t_ns), IMU_SAMPLE)
-    table["t_ns"] = t_ns
+    table["t_ns"], table["period_s"] = t_ns, period_ns * 1e-9
     table["dt_s"] = np.diff(t_ns, prepend=start_ns) * 1e-9
-    table["held_s"] = np.where(interval[source] > GAP_FACTOR * imu.period_ns, table["dt_s"], 0.0)
+    table["held_s"] = np.where(held, (interval[source] - period_ns) * 1e-9, 0.0)
+    source = np.where(held, np.maximum(source - 1, 0), source)
     table["w_WI_I"], table["f_I"] = imu.w_WI_I[source], imu.f_I[source]
     return table

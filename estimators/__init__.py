@@ -1,6 +1,10 @@
 """The measurement physics, once; then one module per estimator."""
 
-from .interface import FACTORS, Diverged, Estimator, Pass
-from .registry import ESTIMATORS, create
+from .compiled_cache import forget_stale_code
+
+forget_stale_code()  # before anything is compiled or loaded
+
+from .interface import FACTORS, Diverged, Estimator, Pass  # noqa: E402
+from .registry import ESTIMATORS, create  # noqa: E402
 
 __all__ = ["ESTIMATORS", "FACTORS", "Diverged", "Estimator", "Pass", "create"]

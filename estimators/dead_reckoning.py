@@ -81,7 +81,7 @@ class DeadReckoningPass:
 
     def _take(self, reading: Any) -> None:
         kind, z = int(reading["kind"]), reading["z"]
-        if SENSOR[kind] not in self._config.factors:
+        if SENSOR[kind] not in self._config.factors or np.isinf(reading["sigma"]).all():
             return
         if reading["t_ns"] <= self._newest_ns[kind]:
             self.counts["late"] += 1

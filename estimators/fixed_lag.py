@@ -24,12 +24,13 @@ from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
 from .dvl_preintegration import preintegrate_dvl
+from .eskf import correct, propagate
 from .gtsam_border import (
     carried_factor,
     displacement_factor,
     estimated_belief,
     estimated_state,
-    explain,
+    gtsam_failures,
     insert_state,
     preintegrate_imu,
     prior_factor,
@@ -40,6 +41,8 @@ from .interface import FACTORS, Diverged, Factors, Inflation
 from .records import as_belief, as_record, split, with_rate_noise
 
 DvlFactor = Literal["velocity", "preintegrated-loose"]
+LONGEST_SILENCE_S = 1.0
+"""A first-order bias correction, and one factor's rounding, hold for about so long without a keyframe."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -48,15 +51,20 @@ class FixedLagSmoother:
     """MAP over the last lag_s seconds; older states are marginalised out.
 
     A DVL reading makes a keyframe, or with keyframe_period_s the first one after that long. Where the DVL is silent for
-    keyframe_timeout_s, the next other reading makes one.
+    keyframe_timeout_s, the next other reading makes one; where everything is silent, time does, so that no IMU factor
+    spans much more than a second. Between keyframes the belief is carried on and corrected as a filter would; the graph
+    does not see that.
 
     Attributes:
         lag_s: length of the window.
         dvl: how DVL readings enter. "velocity": each by its own factor (eq. 4). "preintegrated-loose": summed to a
             displacement from keyframe to keyframe (eq. 6). With both, the reading at a keyframe goes by its velocity
-            and the others are summed, so that none is used twice.
+            and the others are summed, so that none is used twice. A reading that comes after its interval was closed
+            goes by its velocity whatever is said here.
         dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
-            straight.
+            straight, up to the reading at the interval's end (which so has a small part in two factors). Held, its
+            covariance knows the DVL's and the gyro's noise but not what is lost by holding: on a vehicle that
+            manoeuvres it claims too much.
         keyframe_period_s: None for every DVL reading (1 s with a preintegrated factor).
         keyframe_timeout_s: see above.
         max_hold_s: an interval with a longer silence of the DVL is not preintegrated; its readings go by velocity.
@@ -79,7 +87,7 @@ class FixedLagSmoother:
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     factorization: Literal["QR", "CHOLESKY"] = "QR"
-    relinearize: tuple[Positive, Positive, Positive, Positive] = (0.005, 1e3, 0.05, 1.0)
+    relinearize: tuple[Positive, Positive, Positive, Positive] = (0.005, 10.0, 0.05, 1.0)
     hindsight_covariance_s: Positive = 5.0
 
     @property
@@ -126,6 +134,7 @@ class FixedLagPass:
         self._config = config
         self._rig = compile_rig(rig, config.factors, config.inflate)
         self._R_BI = rig.imu.R_BS
+        self._silence_ns = int((config.period_s + LONGEST_SILENCE_S) * 1e9)
         self._inflate: list[float] = self._rig["inflate"][0].tolist()
         self._start_ns = self._now_ns = self._dvl_heard_ns = prior.t_ns
         self._smoother = _smoother(config)
@@ -140,7 +149,8 @@ class FixedLagPass:
         self._graph.add(prior_factor(as_record(prior), self._rig))
         values = gtsam.Values()
         insert_state(values, 0, prior.state, self._R_BI)
-        self._update(values, self._window[0])
+        with gtsam_failures():
+            self._update(values, self._window[0])
 
     # --- the interface -----------------------------------------------------------------------------------------------
 
@@ -153,19 +163,30 @@ class FixedLagPass:
         self._now_ns = epoch.t_ns
         if epoch.tick:
             self._ticks.append(epoch.t_ns)
-        if len(epoch.readings):
-            self._receive(epoch.readings)
+        with gtsam_failures():
+            if len(epoch.readings):
+                self._receive(epoch.readings)
+            while self._now_ns - self._window[-1].t_ns > self._silence_ns:
+                self._make_keyframe(self._window[-1].t_ns + self._silence_ns)
 
     def belief(self) -> Belief:
         """See `Pass.belief`."""
         newest = self._window[-1]
-        if self._belief is None:
-            self._belief = estimated_belief(self._smoother, newest.index, newest.t_ns, self._R_BI)
-        return with_rate_noise(self._carry(newest, self._belief, self._now_ns), self._rig)
+        with gtsam_failures():
+            self._flush()
+            if self._belief is None:
+                self._belief = estimated_belief(self._smoother, newest.index, newest.t_ns, self._R_BI)
+        return with_rate_noise(self._filter_on(newest, self._belief), self._rig)
 
     def finish(self) -> Trajectory | None:
         """See `Pass.finish`. States still in the window have seen less than the lag: all that there was."""
-        self._leave(list(self._window))
+        with gtsam_failures():
+            if self._now_ns - self._window[-1].t_ns > self._config.merge_ns:
+                self._make_keyframe(self._now_ns)
+            for reading in self._pending:
+                self._add_reading(self._window[-1], reading)
+            self._flush()
+            self._leave(list(self._window))
         return Trajectory.from_beliefs(self._hindsight, self._config.lag_s) if self._hindsight else None
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
@@ -176,8 +197,10 @@ class FixedLagPass:
         for k in np.argsort(readings["t_ns"], kind="stable").tolist():
             reading = readings[k : k + 1]
             kind, t_ns = int(reading["kind"][0]), int(reading["t_ns"][0])
-            if np.isinf(self._inflate[kind]):
+            if np.isinf(self._inflate[kind]) or not np.isfinite(reading["sigma"]).any():
                 continue
+            if kind == DVL:
+                self._dvl_heard_ns = self._now_ns
             if t_ns < self._window[-1].t_ns - self._config.merge_ns:
                 self._receive_late(reading, t_ns)
             else:
@@ -186,8 +209,6 @@ class FixedLagPass:
         for kind, t_ns in new:
             if self._calls_for_keyframe(kind, t_ns):
                 self._make_keyframe(t_ns)
-        if (readings["kind"] == DVL).any():
-            self._dvl_heard_ns = self._now_ns
 
     def _calls_for_keyframe(self, kind: int, t_ns: int) -> bool:
         since_ns = t_ns - self._window[-1].t_ns
@@ -227,7 +248,7 @@ class FixedLagPass:
             at_ns = int(reading["t_ns"][0])
             if at_ns > t_ns + self._config.merge_ns:
                 self._pending.append(reading)
-            elif self._config.preintegrates and reading["kind"][0] == DVL:
+            elif self._config.preintegrates and int(reading["kind"][0]) == DVL:
                 self._sum_or_use(last, new, reading)
             else:
                 self._add_reading(new if abs(at_ns - t_ns) <= self._config.merge_ns else last, reading)
@@ -246,11 +267,8 @@ class FixedLagPass:
             leaving.append(self._window.popleft())
         self._leave(leaving)
         stamps: dict[Any, Any] = {key(new.index): t_s for key in (X, V, B)}
-        try:
-            self._smoother.update(self._graph, values, stamps)
-            state = estimated_state(self._smoother, new.index, self._R_BI)
-        except RuntimeError as error:
-            raise Diverged(f"GTSAM: {explain(error)}") from None
+        self._smoother.update(self._graph, values, stamps)
+        state = estimated_state(self._smoother, new.index, self._R_BI)
         if not np.isfinite(state.p_WB_W).all():
             raise Diverged("the newest position is not finite")
         self._graph = gtsam.NonlinearFactorGraph()
@@ -258,6 +276,13 @@ class FixedLagPass:
         if new.index > 0:
             self._window.append(new)
             self._state, self._belief = state, None
+
+    def _flush(self) -> None:
+        """Let the smoother have the factors of late readings that no keyframe has taken along."""
+        if self._graph.size():
+            self._smoother.update(self._graph, gtsam.Values(), {})
+            self._graph = gtsam.NonlinearFactorGraph()
+            self._state, self._belief = self._state_of(self._window[-1]), None
 
     # --- factors -----------------------------------------------------------------------------------------------------
 
@@ -278,17 +303,22 @@ class FixedLagPass:
         at_new = abs(int(reading["t_ns"][0]) - new.t_ns) <= self._config.merge_ns
         if at_new and "velocity" in self._config.dvl:
             self._add_reading(new, reading)
+        elif at_new:
+            new.dvl.append(reading)
+            if self._config.dvl_between == "straight":
+                last.dvl.append(reading)
         else:
-            (new if at_new else last).dvl.append(reading)
+            last.dvl.append(reading)
 
     def _add_displacement(self, last: Keyframe, new: Keyframe) -> None:
         """Add the preintegrated-DVL factor of an interval, or its readings one by one where the DVL was silent."""
         if not last.dvl:
             return
         readings = np.concatenate(last.dvl)
+        readings = readings[np.argsort(readings["t_ns"], kind="stable")]
         times = np.concatenate([[last.t_ns], readings["t_ns"], [new.t_ns]])
         if np.diff(times).max() > self._config.max_hold_s * 1e9 or not np.isfinite(readings["sigma"]).all():
-            for k in range(len(readings)):
+            for k in np.flatnonzero(readings["t_ns"] < new.t_ns - self._config.merge_ns).tolist():
                 self._add_reading(last, readings[k : k + 1])
             return
         straight = self._config.dvl_between == "straight"
@@ -330,6 +360,23 @@ class FixedLagPass:
         state, F, Q = self._predict(*self._block(keyframe, belief.state, t_ns), t_ns)
         return Belief(t_ns, state, sandwich(F, belief.P) + Q)
 
+    def _filter_on(self, keyframe: Keyframe, belief: Belief) -> Belief:
+        """Return the belief at the newest keyframe, carried to now and corrected by the readings since."""
+        if self._now_ns == keyframe.t_ns and not self._pending:
+            return belief
+        assert keyframe.before is not None
+        state, block = as_record(belief), np.zeros(1, BLOCK)
+        rest, before = keyframe.imu, keyframe.before
+        for reading in [*sorted(self._pending, key=_time_of), None]:
+            t_ns = self._now_ns if reading is None else max(_time_of(reading), keyframe.t_ns)
+            part, rest = split(rest, t_ns)
+            if len(part):
+                propagate(state, self._rig, before, part, block)
+                before = part[-1:]
+            if reading is not None and not correct(state, self._rig, reading):
+                raise Diverged("the innovation covariance is not positive, or the state is not finite")
+        return as_belief(self._now_ns, state)
+
     # --- hindsight ---------------------------------------------------------------------------------------------------
 
     def _leave(self, keyframes: list[Keyframe]) -> None:
@@ -344,6 +391,10 @@ class FixedLagPass:
                 else:
                     belief = Belief(keyframe.t_ns, self._state_of(keyframe), np.full((15, 15), np.nan))
                 self._hindsight.append(with_rate_noise(self._carry(keyframe, belief, t_ns), self._rig))
+
+
+def _time_of(reading: NDArray[Any]) -> int:
+    return int(reading["t_ns"][0])
 
 
 def _smoother(config: FixedLagSmoother) -> gtsam.IncrementalFixedLagSmoother:

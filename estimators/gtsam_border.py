@@ -7,6 +7,8 @@ Everything is converted here and nowhere else.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gtsam
@@ -33,6 +35,8 @@ from .so3 import (
 
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
+LEAST_WALK = 1e-4
+"""1/s: a bias must walk for GTSAM; by this much of the white noise nobody notices."""
 INTEGRATION_DENSITY = 1e-5
 """m/√s: GTSAM wants some; ten micrometres in a second keep a block of one sample regular."""
 
@@ -88,14 +92,15 @@ def preintegrate_imu(
     What gaps add to the noise is spread over the block as white noise of the same total.
     """
     g, b = rig[0], block[0]
-    T, held = float(b["T"]), imu["held_s"]
+    held_s = float(imu["held_s"] @ imu["dt_s"]) / float(b["T"])
     gyro_var, accel_var = g["gyro_density"] ** 2, g["accel_density"] ** 2
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(g["gravity"])
-    params.setGyroscopeCovariance((gyro_var + HELD_RATE**2 * (held @ held) / T) * np.eye(3))
-    params.setAccelerometerCovariance((accel_var + HELD_ACCEL**2 * (held @ held) / T) * np.eye(3))
+    params.setGyroscopeCovariance((gyro_var + HELD_RATE**2 * held_s) * np.eye(3))
+    params.setAccelerometerCovariance((accel_var + HELD_ACCEL**2 * held_s) * np.eye(3))
     params.setIntegrationCovariance(INTEGRATION_DENSITY**2 * np.eye(3))
-    params.setBiasAccCovariance(g["accel_walk"] ** 2 * np.eye(3))
-    params.setBiasOmegaCovariance(g["gyro_walk"] ** 2 * np.eye(3))
+    accel_walk, gyro_walk = (max(g[f"{s}_walk"], LEAST_WALK * g[f"{s}_density"]) for s in ("accel", "gyro"))
+    params.setBiasAccCovariance(accel_walk**2 * np.eye(3))
+    params.setBiasOmegaCovariance(gyro_walk**2 * np.eye(3))
     bias = gtsam.imuBias.ConstantBias(g["R_BI"] @ b["b_a"], g["R_BI"] @ b["b_g"])
     preintegrated = gtsam.PreintegratedCombinedMeasurements(params, bias)
     accel, gyro, dts = equivalent_samples(imu, before, rig, block)
@@ -304,10 +309,7 @@ def estimated_state(smoother: gtsam.IncrementalFixedLagSmoother, i: int, R_BI: A
 def estimated_belief(smoother: gtsam.IncrementalFixedLagSmoother, i: int, t_ns: int, R_BI: Array) -> Belief:
     """Return keyframe i with its covariance, in our error state."""
     state = estimated_state(smoother, i, R_BI)
-    try:
-        joint = smoother.getISAM2().jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix()
-    except RuntimeError as error:
-        raise Diverged(f"GTSAM: {explain(error)}") from None
+    joint = smoother.getISAM2().jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix()
     G = np.zeros((15, 15))
     G[THETA, THETA] = G[VELOCITY, VELOCITY] = np.eye(3)
     G[POSITION, POSITION] = state.R_WB
@@ -315,7 +317,14 @@ def estimated_belief(smoother: gtsam.IncrementalFixedLagSmoother, i: int, t_ns: 
     return Belief(t_ns, state, G @ joint @ G.T)
 
 
-def explain(error: RuntimeError) -> str:
-    """Return what GTSAM says, on one line, its keys by name."""
-    text = " ".join(str(error).split())
-    return re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), text)[:300]
+@contextmanager
+def gtsam_failures() -> Iterator[None]:
+    """Turn what GTSAM throws into `Diverged`, on one line, its keys by name; after a throw a smoother is dead."""
+    try:
+        yield
+    except Diverged:
+        raise
+    except (RuntimeError, ValueError) as error:
+        text = " ".join(str(error).split())
+        named = re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), text)
+        raise Diverged(f"GTSAM: {named[:300]}") from None

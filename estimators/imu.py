@@ -36,7 +36,7 @@ from ..datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, A
 from .so3 import cross, exp, exp_into, product, product_into, right_jacobian, skew, transform
 
 HELD_RATE = 0.1
-"""rad/s: how far the rate may stray from the sample that is held over a gap."""
+"""rad/s: how far the rate may stray, for the whole of a gap, from the sample that is held over it."""
 HELD_ACCEL = 0.5
 """m/s²: the same for the specific force."""
 
@@ -218,8 +218,8 @@ def _spread(
             w_turned[1, j] += w[2] * x - w[0] * z
             w_turned[2, j] += w[0] * y - w[1] * x
 
-        q = g.gyro_density**2 * dt + (HELD_RATE * held) ** 2
-        q_a = g.accel_density**2 * dt + (HELD_ACCEL * held) ** 2
+        q = g.gyro_density**2 * dt + HELD_RATE**2 * held * dt  # sums to (HELD_RATE gap)², however the gap is split
+        q_a = g.accel_density**2 * dt + HELD_ACCEL**2 * held * dt
         gyro += q
         accel += q_a
         accel_1 += q_a * remains
@@ -339,8 +339,9 @@ def first_sample(imu: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
     """
     if not len(imu):
         return np.zeros(1, IMU_SAMPLE)
-    L = skew(rig["p_BI_B"][0])
-    rig["rate_cov"] = rig["gyro_density"][0] ** 2 / imu["dt_s"].max() * (L @ L.T)
+    if rig["p_BI_B"].any():
+        L = skew(rig["p_BI_B"][0])
+        rig["rate_cov"] = rig["gyro_density"][0] ** 2 / imu["period_s"][0] * (L @ L.T)
     row = imu[:1].copy()
     if len(imu) > 1:
         for name in ("w_WI_I", "f_I"):

@@ -60,12 +60,15 @@ def yaw_residual(R_WB: Array, R_BH: Array, yaw_rad: float, H: Array) -> float:
     """r(x) = yaw(R_WB R_BH) − yaw_rad, wrapped                                     [the heading-only form of eq. 3]
 
     By the heading sensor's own rotation its derivative is (0, sin φ / cos θ, cos φ / cos θ), with φ, θ its roll and
-    pitch; singular where its x axis is vertical. Returns r (rad) and fills H (1, 15).
+    pitch. Within 2° of its x axis being vertical a yaw says nothing: r and H are zero there. Returns r (rad) and fills
+    H (1, 15).
     """
     R_WH = product(R_WB, R_BH)
     # cos θ sin φ = R[2,1], cos θ cos φ = R[2,2], and cos² θ = R[0,0]² + R[1,0]²
-    cos2 = max(R_WH[0, 0] ** 2 + R_WH[1, 0] ** 2, 1e-12)
+    cos2 = R_WH[0, 0] ** 2 + R_WH[1, 0] ** 2
     H[:] = 0.0
+    if cos2 < 1e-3:
+        return 0.0
     for i in range(3):
         H[0, i] = (R_BH[i, 1] * R_WH[2, 1] + R_BH[i, 2] * R_WH[2, 2]) / cos2
     return wrap(yaw_of(R_WH) - yaw_rad)
@@ -139,7 +142,8 @@ def measure(
         spread = reading.sigma[i] * g.inflate[kind]
         if not math.isinf(spread):
             r[n], H[n] = r[i], H[i]
-            C[n, :], C[:, n] = C[i, :], C[:, i].copy()
+            C[n, :] = C[i, :]
+            C[:, n] = C[:, i].copy()
             C[n, n] += spread**2
             n += 1
     return n

@@ -41,9 +41,6 @@ def split(imu: NDArray[Any], t_ns: int) -> tuple[NDArray[Any], NDArray[Any]]:
         began_ns = int(tail["t_ns"][0]) - round(float(tail["dt_s"][0]) * 1e9)
         if began_ns < t_ns:
             head, tail = np.concatenate([head, tail[:1]]), tail.copy()
-            for part, dt_ns in ((head[-1:], t_ns - began_ns), (tail[:1], int(tail["t_ns"][0]) - t_ns)):
-                bridging = part["held_s"] > 0
-                part["dt_s"] = dt_ns * 1e-9
-                part["held_s"] = np.where(bridging, part["dt_s"], 0.0)
+            head["dt_s"][-1], tail["dt_s"][0] = (t_ns - began_ns) * 1e-9, (int(tail["t_ns"][0]) - t_ns) * 1e-9
             head["t_ns"][-1] = t_ns
     return head, tail

@@ -78,7 +78,7 @@ class Path:
         """IMU_SAMPLE rows: means over the intervals, by Gauss–Legendre quadrature of the IMU's own path."""
         nodes, weights = np.polynomial.legendre.leggauss(4)
         rows = np.zeros(len(t_end_s), IMU_SAMPLE)
-        rows["t_ns"], rows["dt_s"] = np.round(t_end_s * 1e9), dt_s
+        rows["t_ns"], rows["dt_s"], rows["period_s"] = np.round(t_end_s * 1e9), dt_s, dt_s
         g_W = np.array([0, 0, -rig.gravity])
         for node, weight in zip(nodes, weights, strict=True):
             t = t_end_s - dt_s * (0.5 - 0.5 * node)

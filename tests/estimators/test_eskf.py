@@ -31,7 +31,7 @@ def still(t_s: float, readings: np.ndarray, dt_s: float = 0.01) -> Epoch:
     from fathom.datasets.epochs import IMU_SAMPLE
 
     imu = np.zeros(round(t_s / dt_s), IMU_SAMPLE)
-    imu["dt_s"], imu["f_I"] = dt_s, [0, 0, 9.81]
+    imu["dt_s"], imu["period_s"], imu["f_I"] = dt_s, dt_s, [0, 0, 9.81]
     imu["t_ns"] = np.round(np.arange(1, len(imu) + 1) * dt_s * 1e9)
     readings["t_ns"] = readings["received_ns"] = imu["t_ns"][-1]
     return Epoch(int(imu["t_ns"][-1]), imu, readings, False)

@@ -178,7 +178,7 @@ def test_covariance_of_a_chain_of_blocks_is_what_monte_carlo_finds(lever_m: floa
 def test_a_gap_grows_the_covariance() -> None:
     rig = compile_rig(Rig(NOISE), FACTORS, {})
     imu = np.zeros(1, IMU_SAMPLE)
-    imu["dt_s"], imu["f_I"] = 0.5, [0, 0, GRAVITY]
+    imu["dt_s"], imu["period_s"], imu["f_I"] = 0.5, 0.5, [0, 0, GRAVITY]
     blocks = np.zeros(1, BLOCK), np.zeros(1, BLOCK)
     for block, held in zip(blocks, (0.0, 0.5), strict=True):
         imu["held_s"] = held

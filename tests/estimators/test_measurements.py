@@ -95,6 +95,28 @@ def test_components_that_were_not_measured_are_left_out() -> None:
     assert C.shape == (1, 1)
 
 
+@pytest.mark.parametrize("mask", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 1, 1)])
+def test_covariance_of_a_partial_reading_is_the_block_of_the_whole(mask: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(2)
+    state, rig = random_state(rng), compile_rig(random_rig(rng), FACTORS, {})
+    A = rng.normal(size=(3, 3))
+    rig["rate_cov"] = A @ A.T
+    measured = np.array(mask, bool)
+    row = reading(DVL, np.ones(3), np.where(measured, [0.1, 0.2, 0.3], np.inf))
+    r, H, C = np.zeros(3), np.zeros((3, 15)), np.zeros((3, 3))
+    n = measure(row, 0, as_record(Belief(0, state, np.zeros((15, 15)))), rig, r, H, C)
+    whole = A @ A.T + np.diag([0.01, 0.04, 0.09])
+    assert np.allclose(C[:n, :n], whole[np.ix_(measured, measured)])
+
+
+def test_a_heading_says_nothing_when_its_axis_points_up() -> None:
+    R_WB = Rotation.from_euler("ZYX", [40, 89.0, 0], degrees=True).as_matrix()
+    state = NavState(R_WB, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    r, H, _ = residual(reading(HEADING, np.radians([70.0]), np.array([0.02])), state, Rig(NOISE))
+    assert r[0] == 0.0
+    assert not H.any()
+
+
 def test_inflation_scales_sigma_and_infinity_switches_a_sensor_off() -> None:
     state, rig = random_state(np.random.default_rng(1)), Rig(NOISE, imu=Mounting())
     row = reading(DEPTH, np.zeros(1), np.array([0.1]))

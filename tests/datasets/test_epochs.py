@@ -1,0 +1,113 @@
+"""A log is cut as a vehicle lives through it: by reception, exactly covered by the IMU, and without a look ahead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fathom.bench.run import run_log
+from fathom.datasets import Log
+from fathom.datasets.epochs import cut
+from fathom.datasets.log import ImuStream
+from fathom.datasets.scenario import DepthSpec, DvlSpec, Scenario
+from fathom.datasets.simulator import simulate
+from fathom.estimators import create
+
+
+def with_gap(log: Log, begin_s: float, end_s: float) -> Log:
+    """The log without its IMU samples in (begin_s, end_s)."""
+    t_s = (log.imu.t_ns - log.start_ns) * 1e-9
+    keep = (t_s < begin_s + 1e-6) | (t_s > end_s - 1e-6)
+    return replace(log, imu=ImuStream(log.imu.t_ns[keep], log.imu.w_WI_I[keep], log.imu.f_I[keep]))
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    """Odd rates and delays, so that little falls on an IMU sample."""
+    return simulate(Scenario(duration_s=30.0, dvl=DvlSpec(rate_hz=3.7, delay_s=0.013), depth=DepthSpec(rate_hz=9.3)), 1)
+
+
+def test_imu_rows_cover_every_epoch_exactly(log: Log) -> None:
+    ticks = log.start_ns + np.arange(1, 30, dtype=np.int64) * 333_333_333
+    before_ns = log.start_ns
+    for epoch in cut(log, ticks).epochs:
+        assert round(float(epoch.imu["dt_s"].sum()) * 1e9) == pytest.approx(epoch.t_ns - before_ns, abs=2)
+        assert epoch.imu["t_ns"][-1] == epoch.t_ns
+        assert (epoch.readings["received_ns"] == epoch.t_ns).all()
+        assert (epoch.readings["t_ns"] <= epoch.t_ns).all()
+        before_ns = epoch.t_ns
+
+
+def test_splitting_keeps_the_integral_of_every_sample(log: Log) -> None:
+    epochs = cut(log, log.imu.t_ns[-1:]).epochs
+    turned = sum((epoch.imu["w_WI_I"] * epoch.imu["dt_s"][:, None]).sum(axis=0) for epoch in epochs)
+    period_s = log.imu.period_ns * 1e-9
+    assert np.allclose(turned, log.imu.w_WI_I.sum(axis=0) * period_s, rtol=1e-9)
+
+
+def test_every_reading_comes_once_in_the_order_of_reception(log: Log) -> None:
+    voyage = cut(log)
+    received = np.concatenate([epoch.readings["received_ns"] for epoch in voyage.epochs])
+    inside = sum(np.count_nonzero(s.received_ns <= log.imu.t_ns[-1]) for s in log.streams.values())
+    assert len(received) == inside
+    assert (np.diff(received) >= 0).all()
+    assert voyage.counts["readings_outside"] == sum(map(len, log.streams.values())) - inside
+
+
+def test_sensors_that_are_not_asked_for_make_no_epochs(log: Log) -> None:
+    kinds = {int(k) for epoch in cut(log, sensors={"depth"}).epochs for k in epoch.readings["kind"]}
+    assert kinds == {1}
+
+
+def test_in_a_gap_the_sample_before_is_held_never_the_one_after(log: Log) -> None:
+    gappy = with_gap(log, 10.0, 10.8)
+    ticks = log.start_ns + np.arange(10_100_000_000, 10_800_000_000, 100_000_000, dtype=np.int64)
+    voyage = cut(gappy, ticks)
+    assert voyage.counts["imu_gaps_bridged"] == 1
+    assert voyage.failure is None
+    rows = np.concatenate([epoch.imu for epoch in voyage.epochs])
+    t_s = (rows["t_ns"] - log.start_ns) * 1e-9
+    last_known = log.imu.w_WI_I[np.searchsorted(log.imu.t_ns, log.start_ns + 10_000_000_000)]
+    in_gap = (t_s > 10.0 + 1e-6) & (t_s < 10.79 + 1e-6)
+    assert (rows["w_WI_I"][in_gap] == last_known).all()
+    assert rows["held_s"][in_gap] == pytest.approx(0.79)
+    assert (rows["held_s"][~in_gap] == 0).all()
+
+
+@pytest.mark.parametrize("name", ["eskf", "fls"])
+def test_a_gap_costs_the_same_however_often_one_looks(log: Log, name: str) -> None:
+    alone = replace(with_gap(log, 10.0, 10.8), dvl=None, depth=None, gps=None, heading=None)
+    sigma = []
+    for period_s in (5.0, 0.1):
+        online = run_log(alone, create(name), score_period_s=period_s).online
+        row = int(np.flatnonzero(online.t_ns == log.start_ns + 15_000_000_000)[0])
+        sigma.append(np.sqrt(np.diag(online.P[row])))
+    assert sigma[1] == pytest.approx(sigma[0], rel=0.1)  # a long sample and ten short ones: T³/4 against T³/3
+
+
+@pytest.mark.parametrize("name", ["eskf", "fls"])
+def test_a_tick_just_after_the_start_changes_no_covariance(log: Log, name: str) -> None:
+    beliefs = []
+    for first_ns in (1_000_000_000, 1_000):
+        run = create(name).begin(log.prior, log.rig)
+        for epoch in cut(log, log.start_ns + np.array([first_ns, 3_000_000_000])).epochs:
+            run.step(epoch)
+            if epoch.t_ns >= log.start_ns + 3_000_000_000:
+                break
+        beliefs.append(np.diag(run.belief().P))
+    assert beliefs[1] == pytest.approx(beliefs[0], rel=1e-3)
+
+
+def test_a_prior_long_before_the_first_sample_is_a_gap(log: Log) -> None:
+    late = replace(log, imu=ImuStream(log.imu.t_ns[500:], log.imu.w_WI_I[500:], log.imu.f_I[500:]))
+    assert cut(late, max_gap_s=10.0).counts["imu_gaps_bridged"] == 1
+    failure = cut(late, max_gap_s=1.0).failure
+    assert failure is not None
+    assert failure.startswith("imu gap at 0.000 s")
+
+
+def test_a_gap_beyond_the_bound_ends_the_voyage_where_it_begins(log: Log) -> None:
+    voyage = cut(with_gap(log, 10.0, 12.5), max_gap_s=2.0)
+    assert voyage.failure == "imu gap at 10.000 s: 2.500 s without a sample"
+    assert voyage.epochs[-1].t_ns <= log.start_ns + 10_000_000_000
