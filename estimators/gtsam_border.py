@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..datasets.epochs import ATTITUDE, DEPTH, GPS, HEADING
-from ..datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, NavState
+from ..datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from .imu import BLOCK, HELD_ACCEL, HELD_RATE, STATE, predict, process_noise, unbiased
 from .interface import Diverged
 from .measurements import measure, preintegrated_dvl_residual
@@ -297,24 +297,19 @@ def insert_state(values: gtsam.Values, i: int, state: NavState, R_BI: Array) -> 
     values.insert(B(i), gtsam.imuBias.ConstantBias(R_BI @ state.b_a, R_BI @ state.b_g))
 
 
-def estimated_state(smoother: gtsam.IncrementalFixedLagSmoother, i: int, R_BI: Array) -> NavState:
-    """Return keyframe i as the smoother sees it now."""
-    pose = smoother.calculateEstimatePose3(X(i)).matrix()
-    bias = smoother.calculateEstimateConstantBias(B(i)).vector()
-    return NavState(
-        pose[:3, :3], pose[:3, 3], smoother.calculateEstimateVector(V(i)), R_BI.T @ bias[:3], R_BI.T @ bias[3:]
-    )
+def as_state(pose: gtsam.Pose3, v_WB_W: Array, bias: gtsam.imuBias.ConstantBias, R_BI: Array) -> NavState:
+    """Return GTSAM's three variables of a keyframe as a state of ours."""
+    T_WB, b_B = pose.matrix(), bias.vector()
+    return NavState(T_WB[:3, :3], T_WB[:3, 3], v_WB_W, R_BI.T @ b_B[:3], R_BI.T @ b_B[3:])
 
 
-def estimated_belief(smoother: gtsam.IncrementalFixedLagSmoother, i: int, t_ns: int, R_BI: Array) -> Belief:
-    """Return keyframe i with its covariance, in our error state."""
-    state = estimated_state(smoother, i, R_BI)
-    joint = smoother.getISAM2().jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix()
+def as_covariance(joint: Array, R_WB: Array, R_BI: Array) -> Array:
+    """Return GTSAM's joint covariance of (pose, velocity, bias) as that of our error state, (15, 15)."""
     G = np.zeros((15, 15))
     G[THETA, THETA] = G[VELOCITY, VELOCITY] = np.eye(3)
-    G[POSITION, POSITION] = state.R_WB
+    G[POSITION, POSITION] = R_WB
     G[ACCEL_BIAS, ACCEL_BIAS] = G[GYRO_BIAS, GYRO_BIAS] = R_BI.T
-    return Belief(t_ns, state, G @ joint @ G.T)
+    return G @ joint @ G.T
 
 
 @contextmanager

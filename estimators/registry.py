@@ -10,13 +10,23 @@ from pydantic import ValidationError
 from ..datasets.errors import nearest
 from .dead_reckoning import DeadReckoning
 from .eskf import ErrorStateKalmanFilter
-from .fixed_lag import FixedLagSmoother
+from .eskf_filterpy import FilterpyKalmanFilter
+from .iekf import InvariantKalmanFilter
 from .interface import Estimator
+from .rts import RauchTungStriebelSmoother
+from .smoothers import BatchSmoother, FixedLagSmoother, WholeLogSmoother
+from .ukf import UnscentedKalmanFilter
 
 ESTIMATORS: dict[str, Any] = {
     "dead-reckoning": DeadReckoning,
     "eskf": ErrorStateKalmanFilter,
+    "eskf-filterpy": FilterpyKalmanFilter,
+    "iekf": InvariantKalmanFilter,
+    "ukf": UnscentedKalmanFilter,
+    "rts": RauchTungStriebelSmoother,
     "fls": FixedLagSmoother,
+    "isam2": WholeLogSmoother,
+    "batch": BatchSmoother,
 }
 
 

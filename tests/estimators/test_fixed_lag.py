@@ -172,7 +172,7 @@ def test_factor_slots_stay_bounded() -> None:
     log = simulate(replace(TACTICAL, duration_s=100.0), seed=1)
     run = create("fls", lag_s=3.0).begin(log.prior, log.rig)
     _drive(run, cut(log).epochs)
-    assert run._smoother.getFactors().size() < 200
+    assert run._solver.isam2.getFactorsUnsafe().size() < 200
 
 
 def test_gtsams_refusal_is_reported_as_divergence_with_its_variable() -> None:
@@ -190,7 +190,7 @@ def test_a_long_window_finds_the_optimum_of_its_whole_graph() -> None:
     log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=6)
     run = create("fls", lag_s=100.0, relinearize=(1e-5, 1e-4, 1e-5, 1e-7)).begin(log.prior, log.rig)
     _drive(run, cut(log).epochs)
-    graph, values = run._smoother.getFactors(), run._smoother.calculateEstimate()
+    graph, values = run._solver.isam2.getFactorsUnsafe(), run._solver.isam2.calculateEstimate()
     params = gtsam.LevenbergMarquardtParams()
     params.setLinearSolverType("MULTIFRONTAL_QR")
     optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
@@ -292,9 +292,7 @@ def test_prior_covariance_is_the_first_belief() -> None:
     scale = np.sqrt(np.diag(log.prior.P))
     prior = replace(log.prior, P=(np.eye(15) + 0.02 * (A + A.T)) * np.outer(scale, scale))
     run = create("fls").begin(prior, log.rig)
-    from fathom.estimators.gtsam_border import estimated_belief
-
-    belief = estimated_belief(run._smoother, 0, log.start_ns, log.rig.imu.R_BS)
+    belief = run._solver.belief(0, log.start_ns)
     assert np.allclose(belief.P / np.outer(scale, scale), prior.P / np.outer(scale, scale), atol=1e-6)
     assert np.abs(prior.state.local(belief.state)).max() < 1e-9
     assert B(0) != V(0)

@@ -1,4 +1,4 @@
-"""The fixed-lag smoother on GTSAM's IncrementalFixedLagSmoother: keyframes, factors, and two trajectories.
+"""One pass of any smoother on GTSAM: keyframes, factors, and two trajectories; `solvers` does the solving.
 
 One keyframe holds pose, velocity and biases; neighbours are tied by the IMU. A reading between keyframes is tied to the
 keyframe before it, carried there by the IMU. The pass gives what it believes now, and of each state what it believes
@@ -7,6 +7,7 @@ when that state leaves the window.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from dataclasses import dataclass as plain_dataclass
 from dataclasses import field
@@ -28,8 +29,6 @@ from .eskf import correct, propagate
 from .gtsam_border import (
     carried_factor,
     displacement_factor,
-    estimated_belief,
-    estimated_state,
     gtsam_failures,
     insert_state,
     preintegrate_imu,
@@ -39,6 +38,7 @@ from .gtsam_border import (
 from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
 from .interface import FACTORS, Diverged, Factors, Inflation
 from .records import as_belief, as_record, split, with_rate_noise
+from .solvers import Solver
 
 DvlFactor = Literal["velocity", "preintegrated-loose"]
 LONGEST_SILENCE_S = 1.0
@@ -47,8 +47,8 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
-class FixedLagSmoother:
-    """MAP over the last lag_s seconds; older states are marginalised out.
+class GraphSmoother(ABC):
+    """What every factor-graph smoother can be told; a kind of it says how it solves.
 
     A DVL reading makes a keyframe, or with keyframe_period_s the first one after that long. Where the DVL is silent for
     keyframe_timeout_s, the next other reading makes one; where everything is silent, time does, so that no IMU factor
@@ -56,7 +56,6 @@ class FixedLagSmoother:
     does not see that.
 
     Attributes:
-        lag_s: length of the window.
         dvl: how DVL readings enter. "velocity": each by its own factor (eq. 4). "preintegrated-loose": summed to a
             displacement from keyframe to keyframe (eq. 6). With both, the reading at a keyframe goes by its velocity
             and the others are summed, so that none is used twice. A reading that comes after its interval was closed
@@ -74,10 +73,9 @@ class FixedLagSmoother:
         factorization: iSAM2's; Cholesky fails on the IMU noise of a tactical grade.
         relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
             linearises a variable anew. Position enters every factor linearly but for its rotation into B.
-        hindsight_covariance_s: period at which states that leave the window keep their covariance.
+        hindsight_covariance_s: period at which states with hindsight keep their covariance.
     """
 
-    lag_s: Positive = 3.0
     dvl: Annotated[frozenset[DvlFactor], Field(min_length=1)] = frozenset({"velocity"})
     dvl_between: Literal["held", "straight"] = "held"
     keyframe_period_s: Positive | None = None
@@ -91,6 +89,15 @@ class FixedLagSmoother:
     hindsight_covariance_s: Positive = 5.0
 
     @property
+    @abstractmethod
+    def window_s(self) -> float:
+        """How long a state is kept before it leaves with what has been learnt of it; infinite for the whole log."""
+
+    @abstractmethod
+    def solver(self, R_BI: Array) -> Solver:
+        """Return a new solver for one pass."""
+
+    @property
     def preintegrates(self) -> bool:
         """Whether DVL readings are summed between keyframes."""
         return "preintegrated-loose" in self.dvl
@@ -100,9 +107,9 @@ class FixedLagSmoother:
         """Time between keyframes; 0 for one at every DVL reading."""
         return self.keyframe_period_s or (1.0 if self.preintegrates else 0.0)
 
-    def begin(self, prior: Belief, rig: Rig) -> FixedLagPass:
+    def begin(self, prior: Belief, rig: Rig) -> GraphPass:
         """See `Estimator.begin`."""
-        return FixedLagPass(self, prior, rig)
+        return GraphPass(self, prior, rig)
 
 
 @plain_dataclass
@@ -126,10 +133,10 @@ class Keyframe:
     dvl: list[NDArray[Any]] = field(default_factory=list)
 
 
-class FixedLagPass:
-    """One pass of `FixedLagSmoother`."""
+class GraphPass:
+    """One pass of a `GraphSmoother`."""
 
-    def __init__(self, config: FixedLagSmoother, prior: Belief, rig: Rig) -> None:
+    def __init__(self, config: GraphSmoother, prior: Belief, rig: Rig) -> None:
         self.counts: Counter[str] = Counter()
         self._config = config
         self._rig = compile_rig(rig, config.factors, config.inflate)
@@ -137,7 +144,7 @@ class FixedLagPass:
         self._silence_ns = int((config.period_s + LONGEST_SILENCE_S) * 1e9)
         self._inflate: list[float] = self._rig["inflate"][0].tolist()
         self._start_ns = self._now_ns = self._dvl_heard_ns = prior.t_ns
-        self._smoother = _smoother(config)
+        self._solver = config.solver(rig.imu.R_BS)
         self._graph = gtsam.NonlinearFactorGraph()
         self._state = prior.state
         self._belief: Belief | None = prior
@@ -175,7 +182,7 @@ class FixedLagPass:
         with gtsam_failures():
             self._flush()
             if self._belief is None:
-                self._belief = estimated_belief(self._smoother, newest.index, newest.t_ns, self._R_BI)
+                self._belief = self._solver.belief(newest.index, newest.t_ns)
         return with_rate_noise(self._filter_on(newest, self._belief), self._rig)
 
     def finish(self) -> Trajectory | None:
@@ -186,8 +193,9 @@ class FixedLagPass:
             for reading in self._pending:
                 self._add_reading(self._window[-1], reading)
             self._flush()
+            self._solver.finish()
             self._leave(list(self._window))
-        return Trajectory.from_beliefs(self._hindsight, self._config.lag_s) if self._hindsight else None
+        return Trajectory.from_beliefs(self._hindsight, self._config.window_s) if self._hindsight else None
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
 
@@ -261,14 +269,14 @@ class FixedLagPass:
     def _update(self, values: gtsam.Values, new: Keyframe) -> None:
         """Let what is about to leave the window leave with hindsight, then update, and read off the newest state."""
         t_s = (new.t_ns - self._start_ns) * 1e-9
-        horizon_ns = new.t_ns - int(self._config.lag_s * 1e9) + 1000  # never trust a key at the very edge
+        horizon_ns = new.t_ns - self._config.window_s * 1e9 + 1000  # never trust a key at the very edge
         leaving = []
         while self._window and self._window[0].t_ns < horizon_ns and self._window[0] is not new:
             leaving.append(self._window.popleft())
         self._leave(leaving)
         stamps: dict[Any, Any] = {key(new.index): t_s for key in (X, V, B)}
-        self._smoother.update(self._graph, values, stamps)
-        state = estimated_state(self._smoother, new.index, self._R_BI)
+        self._solver.update(self._graph, values, stamps)
+        state = self._solver.state(new.index)
         if not np.isfinite(state.p_WB_W).all():
             raise Diverged("the newest position is not finite")
         self._graph = gtsam.NonlinearFactorGraph()
@@ -280,7 +288,7 @@ class FixedLagPass:
     def _flush(self) -> None:
         """Let the smoother have the factors of late readings that no keyframe has taken along."""
         if self._graph.size():
-            self._smoother.update(self._graph, gtsam.Values(), {})
+            self._solver.update(self._graph, gtsam.Values(), {})
             self._graph = gtsam.NonlinearFactorGraph()
             self._state, self._belief = self._state_of(self._window[-1]), None
 
@@ -333,7 +341,7 @@ class FixedLagPass:
     # --- states between keyframes ------------------------------------------------------------------------------------
 
     def _state_of(self, keyframe: Keyframe) -> NavState:
-        return estimated_state(self._smoother, keyframe.index, self._R_BI)
+        return self._solver.state(keyframe.index)
 
     def _block(self, keyframe: Keyframe, state: NavState, t_ns: int) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the keyframe's state as a record, and the block from it to t_ns."""
@@ -387,7 +395,7 @@ class FixedLagPass:
                 t_ns = self._ticks.popleft()
                 if t_ns >= self._covariance_due_ns:
                     self._covariance_due_ns = t_ns + int(self._config.hindsight_covariance_s * 1e9)
-                    belief = estimated_belief(self._smoother, keyframe.index, keyframe.t_ns, self._R_BI)
+                    belief = self._solver.belief(keyframe.index, keyframe.t_ns)
                 else:
                     belief = Belief(keyframe.t_ns, self._state_of(keyframe), np.full((15, 15), np.nan))
                 self._hindsight.append(with_rate_noise(self._carry(keyframe, belief, t_ns), self._rig))
@@ -395,17 +403,3 @@ class FixedLagPass:
 
 def _time_of(reading: NDArray[Any]) -> int:
     return int(reading["t_ns"][0])
-
-
-def _smoother(config: FixedLagSmoother) -> gtsam.IncrementalFixedLagSmoother:
-    rotation, position, velocity, bias = config.relinearize
-    thresholds = gtsam.ISAM2ThresholdMap()
-    thresholds.insert(("x", np.array([rotation] * 3 + [position] * 3)))
-    thresholds.insert(("v", np.full(3, velocity)))
-    thresholds.insert(("b", np.full(6, bias)))
-    params = gtsam.ISAM2Params()
-    params.setFactorization(config.factorization)
-    params.setRelinearizeThreshold(thresholds)
-    params.relinearizeSkip = 1
-    params.findUnusedFactorSlots = True
-    return gtsam.IncrementalFixedLagSmoother(config.lag_s, params)

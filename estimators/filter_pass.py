@@ -1,0 +1,165 @@
+"""One pass of any filter of ours: from epoch to epoch, and back where a reading comes late.
+
+What a filter does within an epoch is a function, `Advance`; all that goes on around it is here, once, so that filters
+differ in their filtering alone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from ..datasets.epochs import Epoch
+from ..datasets.rig import Rig
+from ..datasets.state import Belief
+from ..datasets.trajectory import Trajectory
+from .imu import BLOCK, compile_rig, first_sample
+from .interface import FACTORS, Diverged, Factors, Inflation
+from .records import as_belief, as_record, split, with_rate_noise
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """What every filter can be told.
+
+    Attributes:
+        factors: the sensors it may use.
+        inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
+        max_delay_s: how far back it can go for a late reading.
+        merge_ns: a reading at most this much older than its epoch is taken as of its epoch, and counted.
+    """
+
+    factors: Factors = FACTORS
+    inflate: Inflation = Field(default_factory=dict)
+    max_delay_s: float = Field(default=5.0, ge=0, allow_inf_nan=False)
+    merge_ns: int = Field(default=1_000_000, ge=0)
+
+
+class Advance(Protocol):
+    """Takes a state through one epoch, in place.
+
+    Args:
+        state, rig: STATE and RIG records of length 1.
+        before: the IMU_SAMPLE row before the epoch's first.
+        epoch: its readings are all taken as of its end.
+        block: BLOCK record of length 1, filled with the epoch's motion if it has any.
+    """
+
+    def __call__(
+        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], epoch: Epoch, block: NDArray[Any]
+    ) -> bool:
+        """Return False where the estimate is lost."""
+        ...
+
+
+class Lived(NamedTuple):
+    """An epoch that has been lived through, and the state and the sample before it."""
+
+    epoch: Epoch
+    state: NDArray[Any]
+    before: NDArray[Any]
+
+
+class FilterPass:
+    """One pass of a filter.
+
+    A reading that comes late, by at most max_delay_s, is put where it belongs: the filter goes back to the state it had
+    then and lives through the epochs since once more. One that comes later still is counted and left out.
+    """
+
+    def __init__(self, config: FilterOptions, prior: Belief, rig: Rig, advance: Advance) -> None:
+        self.counts: Counter[str] = Counter()
+        self._config = config
+        self._advance = advance
+        self._rig = compile_rig(rig, config.factors, config.inflate)
+        self._t_ns = prior.t_ns
+        self._state = as_record(prior)
+        self._before: NDArray[Any] | None = None
+        self._block = np.zeros(1, BLOCK)
+        self._past: deque[Lived] = deque()
+
+    @property
+    def rig(self) -> NDArray[Any]:
+        """The rig as one RIG record."""
+        return self._rig
+
+    def step(self, epoch: Epoch) -> None:
+        """See `Pass.step`."""
+        # an epoch's readings stand in the order of their truth
+        if len(epoch.readings) and epoch.readings["t_ns"][0] != epoch.t_ns:
+            age_ns = epoch.t_ns - epoch.readings["t_ns"]
+            self.counts["merged"] += int(((age_ns > 0) & (age_ns <= self._config.merge_ns)).sum())
+            if age_ns[0] > self._config.merge_ns:
+                epoch = self._go_back_for_late(epoch)
+        self._live(epoch)
+
+    def belief(self) -> Belief:
+        """See `Pass.belief`."""
+        return with_rate_noise(as_belief(self._t_ns, self._state), self._rig)
+
+    def finish(self) -> Trajectory | None:
+        """A filter has no hindsight."""
+        return None
+
+    def _live(self, epoch: Epoch) -> None:
+        """Predict to the epoch's end, correct by its readings, and remember."""
+        if self._before is None:
+            self._before = first_sample(epoch.imu, self._rig)
+        if self._config.max_delay_s > 0:
+            self._past.append(Lived(epoch, self._state.copy(), self._before))
+            horizon_ns = epoch.t_ns - int(self._config.max_delay_s * 1e9)
+            while self._past[0].epoch.t_ns < horizon_ns:
+                self._past.popleft()
+        if not self._advance(self._state, self._rig, self._before, epoch, self._block):
+            raise Diverged("the innovation covariance is not positive, or the state is not finite")
+        if len(epoch.imu):
+            self._before = epoch.imu[-1:]
+        self._t_ns = epoch.t_ns
+
+    def _go_back_for_late(self, epoch: Epoch) -> Epoch:
+        """Live through the past again with the epoch's late readings in it; return the epoch without them."""
+        is_late = epoch.readings["t_ns"] < epoch.t_ns - self._config.merge_ns
+        late = epoch.readings[is_late]
+        late = late[np.argsort(late["t_ns"], kind="stable")]
+        past = [
+            *self._past,
+            Lived(epoch._replace(readings=epoch.readings[~is_late]), self._state, self._before_or(epoch)),
+        ]
+        began_ns = past[0].epoch.t_ns - round(float(past[0].epoch.imu["dt_s"].sum()) * 1e9)
+        reachable = late[late["t_ns"] > began_ns]
+        self.counts["late"] += len(late) - len(reachable)
+        self.counts["replayed"] += len(reachable)
+        if len(reachable):
+            first = next(i for i, lived in enumerate(past) if lived.epoch.t_ns >= reachable["t_ns"][0])
+            again = [lived.epoch for lived in past[first:]]
+            if first < len(past) - 1:
+                self._state, self._before = past[first].state.copy(), past[first].before
+            for _ in again[:-1]:
+                self._past.pop()
+            for reading in reachable:
+                again = _insert(again, reading)
+            for lived_again in again[:-1]:
+                self._live(lived_again)
+            return again[-1]
+        return past[-1].epoch
+
+    def _before_or(self, epoch: Epoch) -> NDArray[Any]:
+        return first_sample(epoch.imu, self._rig) if self._before is None else self._before
+
+
+def _insert(epochs: list[Epoch], reading: Any) -> list[Epoch]:
+    """Return the epochs with `reading` at its time, splitting the one that it falls into."""
+    t_ns = int(reading["t_ns"])
+    k = next(i for i, epoch in enumerate(epochs) if epoch.t_ns >= t_ns)
+    epoch, row = epochs[k], np.array([reading])
+    if epoch.t_ns == t_ns:
+        split_up = [epoch._replace(readings=np.concatenate([epoch.readings, row]))]
+    else:
+        head, tail = split(epoch.imu, t_ns)
+        split_up = [Epoch(t_ns, head, row, False), epoch._replace(imu=tail)]
+    return [*epochs[:k], *split_up, *epochs[k + 1 :]]
