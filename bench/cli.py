@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets.scenario import Scenario
+    from ..datasets.trajectory import Trajectory
+    from .experiment import Experiment
 
 app = typer.Typer(
     help="Filter or smoother? A benchmark for underwater navigation.",
@@ -25,6 +27,7 @@ app = typer.Typer(
 )
 
 SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+LONGEST_TOLERANCE_S = 1e9
 
 
 class Listing(StrEnum):
@@ -87,23 +90,32 @@ def run(
         except KeyboardInterrupt:
             _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}")
             raise typer.Exit(INTERRUPTED) from None
-        _present(rows, folder)
-    statuses = set(rows["status"])
-    if statuses == {"absent"}:
+        _present(rows, plan, folder)
+    statuses = set(rows.loc[~rows["log"].isin(rows.attrs["kept"]), "status"])
+    if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)
     if statuses - {"done", "absent"}:
         raise typer.Exit(SOME_FAILED)
 
 
-def _present(rows: pd.DataFrame, folder: Path) -> None:
-    """Write the figures and table.csv, and print the table."""
+def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
+    """Write table.csv and the figures of all that was ever run of this plan, and print the table of these rows."""
+    from .experiment import ExperimentError
     from .figures import draw_figures
+    from .runner import rows_of
+    from .store import load_runs
     from .table import print_table, write_table
 
-    write_table(rows, folder / "table.csv")
-    figures = draw_figures(rows, folder)
+    every = rows_of(load_runs(folder), plan.runs())
+    try:
+        write_table(every, folder / "table.csv")
+        figures = draw_figures(every, folder)
+    except OSError as error:
+        raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
     _say(f"{folder}: runs.sqlite, table.csv, {len(figures)} figures")
     print_table(rows)
+    for log, cause in rows.attrs["kept"].items():
+        _say(f"{log}: {cause}; its rows are from an earlier run")
 
 
 @app.command("list")
@@ -115,11 +127,15 @@ def list_(what: Listing) -> None:
 
 
 def _estimators() -> dict[str, str]:
-    from ..estimators.registry import known_estimators
+    from ..estimators.registry import EstimatorError, known_estimators, load_estimator
 
-    return {
-        name: ", ".join(getattr(kind, "__dataclass_fields__", ())) for name, kind in sorted(known_estimators().items())
-    }
+    found = {}
+    for name in known_estimators():
+        try:
+            found[name] = ", ".join(getattr(load_estimator(name), "__dataclass_fields__", ()))
+        except EstimatorError as error:
+            found[name] = str(error).removeprefix(f"{name}: ")
+    return found
 
 
 def _logs() -> dict[str, str]:
@@ -164,7 +180,7 @@ def simulate(
 
         log = simulator.simulate(_scenario(scenario), seed)
         write_folder(log, out)
-        typer.echo(f"{out}: {log.name}, {log.duration_s:.0f} s, imu, {', '.join(log.streams)}, truth")
+        typer.echo(f"{out}: {log.name}, {log.duration_s:.0f} s, {', '.join(['imu', *log.streams, 'truth'])}")
 
 
 def _scenario(text: str) -> Scenario:
@@ -194,10 +210,12 @@ def score(
 ) -> None:
     """Print ATE and RPE of ESTIMATE against TRUTH."""
     with refusing_bad_input():
-        from ..datasets.trajectory import Trajectory
-        from .metrics import ScoreError, ate, rpe
+        from .metrics import ScoreError, ate, check_step, rpe
 
-        true, estimated = Trajectory.from_tum(truth), Trajectory.from_tum(estimate)
+        check_step(delta, unit.value)
+        if not 0 <= tolerance_s <= LONGEST_TOLERANCE_S:
+            raise ScoreError(f"--tolerance-s must be from 0 to {LONGEST_TOLERANCE_S:g}, found {tolerance_s}")
+        true, estimated = _read_tum(truth), _read_tum(estimate)
         tolerance_ns = round(tolerance_s * 1e9)
         absolute = ate(true, estimated, align.value, tolerance_ns)
         rows = _score_rows("ATE", absolute, f"{absolute.n} poses")
@@ -210,6 +228,18 @@ def score(
             settings += f"\nno RPE: {error}"
         _print_scores(rows)
         typer.echo(settings)
+
+
+def _read_tum(path: Path) -> Trajectory:
+    from ..datasets.errors import DatasetError
+    from ..datasets.trajectory import Trajectory
+
+    try:
+        if path.is_dir():
+            raise DatasetError(f"{path}: a folder; expected a TUM file")
+        return Trajectory.from_tum(path)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")

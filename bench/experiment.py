@@ -6,6 +6,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -15,6 +16,7 @@ from pydantic.dataclasses import dataclass
 
 from ..datasets.errors import nearest
 from ..datasets.log import Log
+from ..datasets.opening import CATALOG
 from ..datasets.scenario import Scenario
 from ..estimators.interface import Estimator
 from ..estimators.registry import create
@@ -66,6 +68,17 @@ class LogSpec:
     def duration_s(self) -> float | None:
         """How long a simulated log is; None for a recorded one, which must be opened to know."""
         return None if self.scenario is None else Scenario.from_dict(self.scenario).duration_s
+
+    @property
+    def description_sha256(self) -> str | None:
+        """Of the log.yaml or catalog entry that says how a recorded log is read; None for a simulated one."""
+        if self.log is None:
+            return None
+        path = Path(self.log)
+        catalogued = (CATALOG / f"{name}.yaml" for name in (self.log, path.resolve().name))
+        places = (path / "log.yaml", path, *catalogued)
+        found = next((place for place in places if place.suffix == ".yaml" and place.is_file()), None)
+        return sha256(found.read_bytes()).hexdigest() if found else None
 
     def open(self, seed: int | None, data: Path | None = None, repair: bool = False) -> Log:
         """Simulate the log from this seed, or read it.
@@ -144,7 +157,7 @@ class Experiment:
     logs: Annotated[tuple[LogSpec, ...], Field(min_length=1)]
     estimators: Annotated[tuple[EstimatorSpec, ...], Field(min_length=1)]
     description: str = ""
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = (1,)
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1)] = (1,)
     scores: Scoring = Scoring()
     max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0
@@ -166,7 +179,9 @@ class Experiment:
         try:
             return TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
-            raise ExperimentError(f"{source}: {'; '.join(map(_explain, error.errors()))}") from None
+            # where no item of a list is right, pydantic adds that the list is empty
+            errors = [e for e in error.errors() if not (e["type"] == "too_short" and e["input"])]
+            raise ExperimentError(f"{source}: {'; '.join(map(_explain, errors))}") from None
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Experiment:
@@ -197,11 +212,13 @@ class Experiment:
         """Return how runs on this log are scored."""
         return replace(self.scores, align=log.align or self.scores.align, dims=log.dims or self.scores.dims)
 
-    def spec(self, run: Run) -> dict[str, Any]:
+    def spec(self, run: Run, repair: bool = False) -> dict[str, Any]:
         """Return all that decides a run's numbers, as JSON can hold it: defaults included."""
         source = run.log.log or plain(Scenario.from_dict(run.log.scenario or {}))
         return {
             "log": source,
+            "log_sha256": run.log.description_sha256,
+            "repair": repair,
             "estimator": {"name": run.estimator.name, "config": plain(run.estimator.create())},
             "seed": run.seed,
             "scores": plain(self.scoring(run.log)),
@@ -223,7 +240,11 @@ def find_experiment(name_or_path: str | Path) -> Path:
     """
     shipped, name = shipped_experiments(), str(name_or_path)
     path = shipped.get(name) or shipped.get(name.replace("-", "_")) or Path(name_or_path)
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except (OSError, ValueError):  # too long for a name, or no text for one
+        there = False
+    if not there:
         raise ExperimentError(
             f"{name}: no such experiment or file{nearest(name, shipped)} (shipped: {', '.join(shipped)})"
         )

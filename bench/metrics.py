@@ -4,7 +4,7 @@ from .absolute_error import Ate, Drift, HorizontalError, Outage, ate, drift, hor
 from .alignment import Alignment, align
 from .association import ScoreError, associate
 from .pose_error import Dims, pooled_rmse
-from .relative_error import Pairs, Rpe, SegmentError, Unit, rpe, segment_errors
+from .relative_error import Pairs, Rpe, SegmentError, Unit, check_step, rpe, segment_errors
 from .state_error import BLOCKS, Block, StateErrors, error_state, nees, state_errors
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "align",
     "associate",
     "ate",
+    "check_step",
     "drift",
     "error_state",
     "horizontal_error",

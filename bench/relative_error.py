@@ -20,6 +20,9 @@ RowPairs: TypeAlias = tuple[TimeArray, TimeArray]
 STEP_TOLERANCE = 0.1
 """How far a step may be from delta, relative to it."""
 
+LONGEST_STEP = 1e9
+"""Frames, s or m; so that nanoseconds fit int64."""
+
 
 @dataclass(frozen=True)
 class Rpe:
@@ -191,12 +194,19 @@ def _relative_errors(
     return np.linalg.norm(error, axis=1), rotation_angle(Dt_i @ D[j]), (i, j)
 
 
+def check_step(delta: float, unit: Unit) -> None:
+    """Raise ScoreError where no pair of poses can be delta apart."""
+    if not (0 < delta <= LONGEST_STEP) or (unit == "frames" and delta != int(delta)):
+        raise ScoreError(
+            f"rpe: delta must be positive, at most {LONGEST_STEP:g}, and whole in frames; found {delta} {unit}"
+        )
+
+
 def _choose(t_ns: TimeArray, p: Array, delta: float, unit: Unit, pairs: Pairs) -> RowPairs:
     """Return the rows (i, j) that `rpe` compares, by the table in its docstring."""
     if unit not in ("frames", "s", "m") or pairs not in ("consecutive", "all"):
         raise ScoreError(f"rpe: unit is 'frames', 's' or 'm', pairs 'consecutive' or 'all'; found {unit!r}, {pairs!r}")
-    if not (0 < delta < np.inf) or (unit == "frames" and delta != int(delta)):
-        raise ScoreError(f"rpe: delta must be positive, and whole in frames; found {delta} {unit}")
+    check_step(delta, unit)
     n = len(t_ns)
     if unit == "frames":
         i = np.arange(0, n - int(delta), 1 if pairs == "all" else int(delta))

@@ -11,7 +11,7 @@ from time import perf_counter_ns
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from ..datasets.epochs import Voyage, cut
@@ -28,6 +28,7 @@ from .metrics import (
     align,
     associate,
     ate,
+    check_step,
     drift,
     horizontal_error,
     nees,
@@ -158,6 +159,7 @@ def run_log(
     """
     log, notes = _with_prior(log)
     assert log.prior is not None
+    readings = sum(len(stream) for sensor, stream in log.streams.items() if sensor in estimator.factors)
     limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
     smoothed, finish_ns, counts = None, 0, {}
     with _collector_off():
@@ -184,7 +186,7 @@ def run_log(
         np.array(tape.step_ns, np.int64),
         np.array(tape.belief_ns, np.int64),
         finish_ns,
-        voyage.counts | counts,
+        {"readings": readings} | voyage.counts | counts,
         (driven[-1].t_ns - voyage.start_ns) * 1e-9 if driven else 0.0,
         sum(len(epoch.imu) for epoch in driven),
         notes,
@@ -268,10 +270,10 @@ def score_ticks(log: Log, period_s: float) -> TimeArray:
     """Return the times at which beliefs are asked for, (k,) ns.
 
     With truth they are its own stamps, so that nobody interpolates: the nearest to each point of a regular grid that
-    begins one period after the start. Without, a regular grid from the start.
+    begins one period after the start. Without, or where it is empty, a regular grid from the start.
     """
     period_ns = int(period_s * 1e9)
-    if log.truth is None:
+    if log.truth is None or len(log.truth) == 0:
         return np.arange(log.start_ns + period_ns, int(log.imu.t_ns[-1]) + 1, period_ns, dtype=np.int64)
     stamps, first_ns = log.truth.t_ns, log.start_ns + period_ns
     begin_ns = stamps[np.abs(stamps - first_ns).argmin()]
@@ -328,7 +330,7 @@ class Scoring:
         dims: "2d" counts horizontal positions only, in ATE, RPE and sub-trajectories; drift is always horizontal.
         rpe_delta, rpe_unit, rpe_pairs: see `fathom.bench.metrics.rpe`.
         segment_lengths_m: of the sub-trajectories.
-        score_period_s: beliefs are asked for this far apart.
+        score_period_s: beliefs are asked for this far apart; 1 ms or more.
     """
 
     align: Alignment = "none"
@@ -337,7 +339,12 @@ class Scoring:
     rpe_unit: Unit = "m"
     rpe_pairs: Pairs = "all"
     segment_lengths_m: tuple[Positive, ...] = (50.0, 100.0, 200.0, 400.0)
-    score_period_s: Positive = 1.0
+    score_period_s: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
+
+    @model_validator(mode="after")
+    def _step_is_possible(self) -> Scoring:
+        check_step(self.rpe_delta, self.rpe_unit)
+        return self
 
 
 def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict[str, float | None]:  # noqa: B008

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Sequence
@@ -63,7 +64,7 @@ class Task:
             "align": scoring.align,
             "dims": scoring.dims,
             "estimator": run.estimator.name,
-            "spec": json.dumps(self.experiment.spec(run)),
+            "spec": json.dumps(self.experiment.spec(run, self.repair)),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         } | provenance()
 
@@ -79,7 +80,8 @@ def run_experiment(
     """Run every estimator on every log and return the rows of the store, one per run and output.
 
     A run that fails, diverges, or kills its worker is a row that says so. Interrupted (KeyboardInterrupt), the finished
-    runs are in the store.
+    runs are in the store. A run whose recording is not here keeps the rows of an earlier day; `attrs["kept"]` then maps
+    its log to why it did not run.
 
     Args:
         experiment: an experiment, a shipped one's name, or a YAML file.
@@ -99,14 +101,31 @@ def run_experiment(
     folder = Path(out) / experiment.name
     runs = _select(experiment, only)
     tasks, absent = _order([Task(experiment, run, folder, Path(data) if data else None, repair) for run in runs])
+    _make_room(folder)
     with Store(folder / "runs.sqlite") as store:
-        for row in absent:
-            store.write([row])
+        kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
         with _progress(len(tasks)) as advance:
             for rows in run_all(tasks, jobs):
                 store.write(rows)
                 advance(rows)
-        return _those_of(store.read(), runs)
+        rows = rows_of(store.read(), runs)
+    rows.attrs["kept"] = kept
+    return rows
+
+
+def _make_room(folder: Path) -> None:
+    """Make the folders of the results, before anything runs.
+
+    Raises:
+        ExperimentError: they cannot be made, or something else is where a result will go.
+    """
+    for path in (folder / "trajectories", folder / "figures"):
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ExperimentError(f"{path}: cannot be made ({error.strerror}); give another --out") from None
+    if (folder / "table.csv").is_dir():
+        raise ExperimentError(f"{folder / 'table.csv'}: a folder is in the way; move it, or give another --out")
 
 
 def _select(experiment: Experiment, only: str | None) -> list[Run]:
@@ -147,7 +166,7 @@ def _order(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]]]:
     return sorted(here, key=longest), absent
 
 
-def _those_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
+def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
     """Return the rows of these runs, in their order: the store may hold those of earlier experiments of this name."""
     place = {(run.log.name, run.estimator.label, run.seed): k for k, run in enumerate(runs)}
     keys = zip(rows["log"], rows["label"], rows["seed"], strict=True)
@@ -172,7 +191,8 @@ class Worker:
         context = get_context("spawn")
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=work, args=(theirs,), daemon=True)
-        self.process.start()
+        with _deaf_to_ctrl_c():
+            self.process.start()
         theirs.close()
 
     def begin(self, task: Task) -> None:
@@ -239,6 +259,19 @@ def _collect(worker: Worker, hung: bool) -> list[Row]:
 
 
 @contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Ignore SIGINT, so that a child started here ignores it from its first moment on; only the main thread can."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
 def _single_threaded_children() -> Iterator[None]:
     """Set the variables that libraries read when a child starts; timings are single-threaded."""
     before = {name: os.environ.get(name) for name in THREAD_COUNTS}
@@ -264,7 +297,7 @@ def _progress(total: int) -> Iterator[Any]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("", total=total)
@@ -279,15 +312,14 @@ def _progress(total: int) -> Iterator[Any]:
 
 
 def work(connection: Connection) -> None:
-    """Do tasks until there are no more; Ctrl-C is the parent's affair."""
+    """Do tasks until there are no more, or no parent; Ctrl-C is the parent's affair."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     bench = Bench()
     while True:
         try:
-            task = connection.recv()
-        except EOFError:
+            connection.send(bench.execute(connection.recv()))
+        except (EOFError, OSError):
             return
-        connection.send(bench.execute(task))
 
 
 class Bench:

@@ -101,6 +101,15 @@ class Store:
         except sqlite3.OperationalError as error:
             raise ExperimentError(f"{self.path}: cannot write ({error}); the runs before are kept") from None
 
+    def write_absent(self, row: Row) -> bool:
+        """Add the row of a run that could not be made; return False, and do nothing, where an earlier one left rows."""
+        run = {key: row[key] for key in IDENTITY}
+        found = self.connection.execute(f"SELECT 1 FROM runs WHERE {SAME_RUN} AND status IS NOT 'absent'", run)
+        if found.fetchone():
+            return False
+        self.write([row])
+        return True
+
     def read(self) -> pd.DataFrame:
         """Return every row, in the order in which they were written."""
         return read_rows(self.connection)

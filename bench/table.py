@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ import pandas as pd
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from .metrics import pooled_rmse
 
@@ -68,12 +70,20 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         done = [row for row in group if row["status"] == "done"]
         record: Record = {"log": log, "label": label, "output": output}
         record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
+        record |= _rpe_step(group)
         record |= {"runs": runs[log, label], "done": len(done)}
+        record |= {count: sum(row[count] or 0 for row in done) for count in ("n_scored", "n_rpe")}
         record |= {name: _pooled(done, name, count) for name, count in POOLED.items()}
         record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
         record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
         summary.append(record)
     return summary
+
+
+def _rpe_step(group: Sequence[Record]) -> Record:
+    """Return which RPE a group's is, from its spec; None where that does not tell."""
+    scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
+    return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
 
 
 def _pooled(done: Sequence[Record], name: str, count: str) -> float | None:
@@ -92,14 +102,15 @@ def write_table(rows: pd.DataFrame, path: Path) -> None:
 
 
 def print_table(rows: pd.DataFrame, console: Console | None = None) -> None:
-    """Print one table per log, then what did not come to its end."""
+    """Print one table per log, then what did not come to its end, and whose readings were mostly of no use."""
     if console is None:
         console = Console()
         if not console.is_terminal:
             console = Console(width=120)
     for summary in groups(summarise(rows), "log").values():
         console.print(_table(summary))
-    for line in failures(rows):
+        console.print()
+    for line in failures(rows) + mostly_outside(rows):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
 
 
@@ -116,14 +127,27 @@ def failures(rows: pd.DataFrame) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
+def mostly_outside(rows: pd.DataFrame) -> list[str]:
+    """Return a line for each log that a run came to the end of with most of its readings outside the IMU's time."""
+    lines = {}
+    for row in records(rows):
+        counts = json.loads(row["counts"] or "{}")
+        outside, readings = counts.get("readings_outside", 0), counts.get("readings", math.inf)
+        if row["status"] == "done" and outside > readings / 2:
+            lines[row["log"]] = f"{row['log']}: {outside} of {readings} readings lay outside the log; mend their clock"
+    return list(lines.values())
+
+
 def _table(summary: Sequence[Record]) -> Table:
     first = next((row for row in summary if row["truth_kind"] is not None), summary[0])
     table = Table(
-        title=first["log"],
-        caption=_caption(first),
+        title=Text(first["log"], "table.title"),
+        caption=Text(_caption(first), "table.caption"),
         title_justify="left",
         caption_justify="left",
         box=box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
         padding=(0, 1, 0, 0),
     )
     table.add_column("estimator", overflow="fold", min_width=14)
@@ -134,7 +158,7 @@ def _table(summary: Sequence[Record]) -> Table:
     for (label,), of_label in groups(summary, "label").items():
         for k, row in enumerate(of_label):
             numbers = (_cell(name, row[name]) for name in SHOWN)
-            table.add_row("" if k else label, _lookahead(row), f"{row['done']}/{row['runs']}", *numbers)
+            table.add_row(Text("" if k else label), _lookahead(row), f"{row['done']}/{row['runs']}", *numbers)
     return table
 
 
@@ -142,7 +166,9 @@ def _caption(row: Record) -> str:
     if row["truth_kind"] is None:
         return "nothing to score against"
     against = "the truth" if row["truth_kind"] == "truth" else f"a {row['truth_kind']} (another filter's output)"
-    return f"against {against}; alignment: {row['align']}; ATE and RPE in {row['dims']}; drift is horizontal"
+    delta, unit, pairs = row["rpe_delta"], row["rpe_unit"], row["rpe_pairs"]
+    step = "" if delta is None else f"; RPE over {delta:g} {unit}, {pairs} pairs"
+    return f"against {against}; alignment: {row['align']}; ATE and RPE in {row['dims']}{step}; drift is horizontal"
 
 
 def _lookahead(row: Record) -> str:

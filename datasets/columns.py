@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from .description import Column, Table
 from .errors import DatasetError, nearest
-from .state import TimeArray
+from .state import LIMIT_NS, TimeArray
 
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-LIMIT_NS = 1 << 62
-"""Times beyond this are no times: 146 years either side of 1970."""
 NO_TIME = Decimal("nan")
 
 EXACT: dict[str, Any] = (
@@ -72,7 +70,8 @@ def _read_text(path: Path, table: Table, times: Collection[Column]) -> pd.DataFr
     try:
         lines = path.read_text(encoding=table.encoding).splitlines()
     except UnicodeDecodeError as error:
-        raise DatasetError(f"{path}: byte {error.start} is not {table.encoding}; set `encoding` (latin-1?)") from None
+        guess = "utf-16" if error.object[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
+        raise DatasetError(f"{path}: byte {error.start} is not {table.encoding}; set `encoding` ({guess}?)") from None
     except LookupError:
         raise DatasetError(f"{path}: unknown encoding {table.encoding!r}") from None
     lines = [line for line in lines if line.strip() and not (table.comment and line.startswith(table.comment))]

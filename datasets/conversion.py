@@ -2,11 +2,15 @@
 
 Every stream goes the same way: rows declared invalid are dropped; rows with numbers that are not finite are an error,
 or dropped under `repair`; outliers as declared are dropped; times out of order are an error, or dropped under
-`repair`; every n-th row is kept. Whatever was dropped is told in `Log.notes`.
+`repair`; every n-th row is kept. Whatever was dropped is told in `Log.notes`. A truth or a stream that shares no time
+with the IMU is an error: some clock is wrong.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -110,6 +114,15 @@ class _Rows:
             return values if factor == 1.0 else values * factor
 
 
+@contextmanager
+def _named(folder: Path) -> Iterator[None]:
+    """Put the folder in front of the errors of types that do not know it."""
+    try:
+        yield
+    except DatasetError as error:
+        raise DatasetError(f"{folder}: {error}") from None
+
+
 def build_log(description: d.Description, folder: Path, *, repair: bool = False) -> Log:
     """Read the recording a description tells of.
 
@@ -140,16 +153,17 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
 
-    mountings = {
-        name: part.mounting.mounting()
-        for name in ("depth", "gps", "heading")
-        if (part := getattr(streams, name)) is not None
-    }
-    rig = Rig(streams.imu.noise.noise(), streams.imu.mounting.mounting(), **mountings, gravity=description.gravity)
+    with _named(folder):
+        mountings = {
+            name: part.mounting.mounting()
+            for name in ("depth", "gps", "heading")
+            if (part := getattr(streams, name)) is not None
+        }
+        rig = Rig(streams.imu.noise.noise(), streams.imu.mounting.mounting(), **mountings, gravity=description.gravity)
     degrees = None if origin is None else (float(np.degrees(origin[0])), float(np.degrees(origin[1])))
     if description.origin is not None:
         degrees = (description.origin.latitude_deg, description.origin.longitude_deg)
-    return Log(
+    log = Log(
         name=description.name or folder.resolve().name,
         rig=rig,
         imu=imu,
@@ -163,6 +177,25 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
         notes=(*description.notes, *opening.notes),
         origin=degrees,
     )
+    with _named(folder):
+        _check_clocks(log)
+    return log
+
+
+def _check_clocks(log: Log) -> None:
+    """Refuse a prior outside the IMU's time, and a truth or a stream that shares no time with it."""
+    start_ns, end_ns = int(log.imu.t_ns[0]) - 2 * log.imu.period_ns, int(log.imu.t_ns[-1])
+    imu = f"the IMU's time, {log.imu.t_ns[0] * 1e-9:.3f} s to {end_ns * 1e-9:.3f} s"
+    if log.prior is not None and not start_ns <= log.prior.t_ns < end_ns:
+        raise DatasetError(f"prior: t_ns, {log.prior.t_ns * 1e-9:.3f} s, lies outside {imu}")
+    if log.truth is not None and not len(log.truth):
+        raise DatasetError("truth: no rows; leave `truth` out where nobody knows")
+    for name, part in {**log.streams, "truth": log.truth}.items():
+        if part is not None and len(part) and (part.t_ns[-1] < start_ns or part.t_ns[0] > end_ns):
+            raise DatasetError(
+                f"{name}: {part.t_ns[0] * 1e-9:.3f} s to {part.t_ns[-1] * 1e-9:.3f} s lies wholly outside {imu}; "
+                "check its clock (`clock_offset_s`) and the `unit` of its time"
+            )
 
 
 def _message_names(description: d.Description) -> list[str]:
@@ -231,20 +264,47 @@ def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) 
     return rows
 
 
+def _stray(t_ns: TimeArray) -> Mask:
+    """Return the fewest rows without which times increase; of two such choices, the one that keeps the earlier rows."""
+    late = np.zeros(len(t_ns), bool)
+    late[1:] = t_ns[1:] <= np.maximum.accumulate(t_ns)[:-1]
+    if not late.any():
+        return late
+    last: list[int] = []  # of the increasing runs of length 1, 2, …: the least last time
+    rank = []  # of each row: the longest run that ends there, less one
+    for t in t_ns.tolist():
+        rank.append(bisect_left(last, t))
+        last[rank[-1] : rank[-1] + 1] = [t]
+    if len(last) == np.count_nonzero(~late):
+        return late
+    stray = np.ones(len(t_ns), bool)
+    wanted, below = len(last) - 1, last[-1] + 1
+    for row in range(len(t_ns) - 1, -1, -1):
+        if rank[row] == wanted and t_ns[row] < below:
+            stray[row] = False
+            wanted, below = wanted - 1, t_ns[row]
+    return stray
+
+
 def _in_order(rows: _Rows, every: int) -> NDArray[np.int64]:
     """Refuse times out of order; return which of the rows (as they were) are left, every n-th of them."""
-    before = len(rows.t_ns)
-    latest = np.maximum.accumulate(rows.t_ns) if before else rows.t_ns
-    late = np.zeros(before, bool)
-    late[1:] = rows.t_ns[1:] <= latest[:-1]
     t_ns = rows.t_ns
+    stray = _stray(t_ns)
 
     def out_of_order(row: int) -> str:
+        if row == 0 or t_ns[row] > t_ns[row - 1]:
+            return f"time {t_ns[row]} ns is ahead of rows below"
         how = "repeats" if t_ns[row] == t_ns[row - 1] else "comes before"
         return f"time {t_ns[row]} ns {how} the row above"
 
-    rows.refuse(late, out_of_order, "out of order")
-    left = np.flatnonzero(~late)[::every]
+    lost = np.count_nonzero(stray & ~np.isin(t_ns, t_ns[~stray]))  # a row that repeats a time is no loss
+    if rows.opening.repair and 2 * lost > len(t_ns):
+        raise DatasetError(
+            f"{rows.opening.folder}: {rows.stream}: {lost} of {len(t_ns)} rows are out of order, too many to drop; "
+            "check the column of its time"
+        )
+    rows.refuse(stray, out_of_order, "out of order")
+    left = np.flatnonzero(~stray)[::every]
     if every > 1:
         mask = np.zeros(len(rows.t_ns), bool)
         mask[::every] = True
@@ -293,7 +353,8 @@ def _enu(values: Array, frame: str) -> Array:
 def _imu(opening: _Opening, part: d.ImuDescription) -> ImuStream:
     rows = _stream(opening, "imu", part, [*part.gyro.columns, *part.accel.columns])
     _in_order(rows, part.every)
-    return ImuStream(rows.t_ns, _flu(rows.si(part.gyro), part.axes), _flu(rows.si(part.accel), part.axes))
+    with _named(opening.folder):
+        return ImuStream(rows.t_ns, _flu(rows.si(part.gyro), part.axes), _flu(rows.si(part.accel), part.axes))
 
 
 def _dvl(opening: _Opening, part: d.DvlDescription) -> DvlStream:
@@ -333,6 +394,12 @@ def _heading(opening: _Opening, part: d.HeadingDescription) -> HeadingStream | A
     return HeadingStream(rows.t_ns, rows.received_ns, psi, _sigma(rows, part, 1))
 
 
+def _not_rotations(R: Array) -> Mask:
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        return np.asarray(~(off < 1e-6) | ~(np.linalg.det(R) > 0))
+
+
 def _rotations(rows: _Rows, part: d.Attitude) -> Array:
     """Return (n, 3, 3), body FLU to W; refuse what is not a rotation."""
     values = np.stack([rows.raw[c] for c in part.columns], axis=1).astype(float, copy=False)
@@ -341,9 +408,7 @@ def _rotations(rows: _Rows, part: d.Attitude) -> Array:
         R = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix().reshape(-1, 3, 3)
     elif part.form == "matrix":
         R = values.reshape(-1, 3, 3)
-        with np.errstate(over="ignore", invalid="ignore"):
-            off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-            bad = ~(off < 1e-6) | ~(np.linalg.det(R) > 0)
+        bad = _not_rotations(R)
         rows.refuse(bad, lambda row: f"not a rotation matrix: {values[row]}", "that are not rotations")
         R = R[~bad]
     else:
@@ -476,4 +541,10 @@ def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     bad = np.flatnonzero(~np.isfinite(truth.p_WB_W).all(axis=1))
     if len(bad):
         raise DatasetError(f"{path}: row {bad[0]} ({len(bad)} in all): position is {truth.p_WB_W[bad[0]]}")
+    unknown = np.isnan(truth.R_WB).all(axis=(1, 2))
+    bad = np.flatnonzero(_not_rotations(truth.R_WB) & ~unknown)
+    if len(bad):
+        raise DatasetError(
+            f"{path}: row {bad[0]} ({len(bad)} in all): R_WB is not a rotation: {truth.R_WB[bad[0]].ravel()}"
+        )
     return truth

@@ -16,12 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError, nearest
 from .rig import ImuNoise, Mounting
-from .state import Belief, NavState
+from .state import LIMIT_NS, Array, Belief, NavState
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Sigma = Annotated[float, Field(gt=0)]
+Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
+"""Seconds to add to a time, s: 73 years at most, so that no sum of them overflows."""
 Column = int | str
 Triple = tuple[Finite, Finite, Finite]
 Matrix = tuple[Triple, Triple, Triple]
@@ -189,9 +191,9 @@ class Time(Part):
     """Instead of a column: the time is the row's index at this rate."""
     start_s: Finite = 0.0
     """Time of row 0, with row_rate_hz."""
-    clock_offset_s: Finite = 0.0
+    clock_offset_s: Shift = 0.0
     """Added to the stamps, to bring this sensor's clock onto the log's."""
-    delay_s: NotNegative = 0.0
+    delay_s: Annotated[Shift, Field(ge=0)] = 0.0
     """The stamp is the reception, and the row was true this much earlier."""
     received: Column | None = None
     """Column of the reception, same unit and clock."""
@@ -434,23 +436,39 @@ class Origin(Part):
     longitude_deg: Annotated[float, Field(ge=-360, le=360)]
 
 
+def _is_covariance(P: Array) -> bool:
+    """Whether P is symmetric and positive semi-definite; judged by its correlations, so units do not matter."""
+    sigma = np.sqrt(np.maximum(P.diagonal(), 0.0))
+    sigma[sigma == 0] = 1.0
+    with np.errstate(over="ignore"):
+        C = P / sigma / sigma[:, None]
+    if not (np.abs(C) < 1 + 1e-6).all() or not np.allclose(C, C.T, rtol=0, atol=1e-6):
+        return False
+    return bool(np.linalg.eigvalsh(C).min() > -1e-6)
+
+
 class PriorDescription(Part):
     """A belief at the start, in our frames and SI."""
 
-    t_ns: int
+    t_ns: Annotated[int, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
     R_WB: Matrix
     p_WB_W: Triple
     v_WB_W: Triple
     b_a: Triple
     b_g: Triple
-    P: tuple[tuple[float, ...], ...]
+    P: tuple[tuple[Finite, ...], ...]
+    """Symmetric and positive semi-definite: a zero says that this error is known to be none."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if len(self.P) != 15 or any(len(row) != 15 for row in self.P):
             raise ValueError("P: expected 15 rows of 15")
-        if not np.allclose(np.array(self.R_WB) @ np.array(self.R_WB).T, np.eye(3), atol=1e-6):
-            raise ValueError("R_WB is not a rotation")
+        R, P = np.array(self.R_WB), np.array(self.P)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
+                raise ValueError("R_WB is not a rotation")
+        if not _is_covariance(P):
+            raise ValueError("P is not symmetric and positive semi-definite")
         return self
 
     def belief(self) -> Belief:

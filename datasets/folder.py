@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from .description import Description
+from .description import check_description
 from .errors import DatasetError
 from .log import AttitudeStream, Log, ReadingStream
 from .rig import Mounting
@@ -29,7 +29,7 @@ def write_folder(log: Log, folder: Path | str, fmt: Literal["parquet", "csv"] = 
     """Write log.yaml and one table per stream into `folder`, log.yaml last; `open_log(folder)` gives the log back.
 
     Raises:
-        DatasetError: unknown format, or the folder cannot be written.
+        DatasetError: unknown format, the folder holds a log (or one of the files) already, or it cannot be written.
     """
     if fmt not in ("parquet", "csv"):
         raise DatasetError(f"unknown format {fmt!r}; known: parquet, csv")
@@ -66,8 +66,11 @@ def write_folder(log: Log, folder: Path | str, fmt: Literal["parquet", "csv"] = 
         state = log.prior.state
         vectors = {name: getattr(state, name).tolist() for name in ("R_WB", "p_WB_W", "v_WB_W", "b_a", "b_g")}
         described["prior"] = {"t_ns": int(log.prior.t_ns), **vectors, "P": log.prior.P.tolist()}
-    Description.model_validate(described)
+    check_description(described, str(folder))
     try:
+        for name in ("log.yaml", *(f"{name}.{fmt}" for name in tables)):
+            if (folder / name).exists():
+                raise DatasetError(f"{folder}: holds a {name} already; choose another folder, or remove that one")
         folder.mkdir(parents=True, exist_ok=True)
         for name, table in tables.items():
             if fmt == "parquet":

@@ -16,6 +16,9 @@ from scipy.spatial.transform import Rotation
 Array: TypeAlias = NDArray[np.float64]
 TimeArray: TypeAlias = NDArray[np.int64]
 
+LIMIT_NS = 1 << 62
+"""Times beyond this are no times: 146 years either side of 1970. Two of them subtract without overflow."""
+
 THETA = slice(0, 3)
 POSITION = slice(3, 6)
 VELOCITY = slice(6, 9)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
-from .state import Array, Belief, NavState, TimeArray
+from .state import LIMIT_NS, Array, Belief, NavState, TimeArray
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,8 +48,9 @@ class Trajectory:
             values = getattr(self, name)
             if values is not None and values.shape != shape:
                 raise DatasetError(f"trajectory: {name} has shape {values.shape}, expected {shape}")
-        if n > 1 and (np.diff(self.t_ns) <= 0).any():
-            row = int(np.flatnonzero(np.diff(self.t_ns) <= 0)[0]) + 1
+        late = np.flatnonzero(self.t_ns[1:] <= self.t_ns[:-1])
+        if len(late):
+            row = int(late[0]) + 1
             raise DatasetError(f"trajectory: row {row}: time {self.t_ns[row]} is not after the row above")
 
     def __len__(self) -> int:
@@ -111,23 +112,30 @@ class Trajectory:
         """Read a TUM file; times keep their nanoseconds.
 
         Raises:
-            DatasetError: no such file, a row without eight numbers, a quaternion more than 1e-3 from unit length,
-                or times out of order.
+            DatasetError: names the file: it is not there or cannot be read, a row without eight numbers, a quaternion
+                more than 1e-3 from unit length, a time that is none, or times out of order.
         """
         path = Path(path)
-        if not path.is_file():
-            raise DatasetError(f"{path}: no such file")
+        try:
+            text = path.read_text(encoding="utf-8", errors="replace")
+        except FileNotFoundError:
+            raise DatasetError(f"{path}: no such file") from None
+        except (OSError, ValueError) as error:  # ValueError: a null character in the name
+            raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
         t_ns: list[int] = []
         rows: list[list[float]] = []
-        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        for number, line in enumerate(text.splitlines(), 1):
             fields = line.replace(",", " ").split()
             if not fields or fields[0].startswith("#"):
                 continue
             try:
-                t_ns.append(seconds_to_ns(fields[0]))
-                rows.append([float(x) for x in fields[1:]])
-            except (ValueError, OverflowError):
+                rows.append([float(x) for x in fields][1:])
+            except ValueError:
                 raise DatasetError(f"{path}: line {number}: not numbers: {line[:60]!r}") from None
+            try:
+                t_ns.append(seconds_to_ns(fields[0]))
+            except ValueError as error:
+                raise DatasetError(f"{path}: line {number}: {error}") from None
             if len(rows[-1]) != 7:
                 raise DatasetError(f"{path}: line {number}: expected t x y z qx qy qz qw, found {len(fields)} fields")
             length = float(np.linalg.norm(rows[-1][3:]))
@@ -138,12 +146,11 @@ class Trajectory:
         if not rows:
             raise DatasetError(f"{path}: no poses; expected lines of t x y z qx qy qz qw")
         values = np.array(rows)
-        return cls(
-            np.array(t_ns, dtype=np.int64),
-            Rotation.from_quat(values[:, 3:]).as_matrix(),
-            values[:, :3],
-            lookahead_s=lookahead_s,
-        )
+        R_WB = Rotation.from_quat(values[:, 3:]).as_matrix()
+        try:
+            return cls(np.array(t_ns, dtype=np.int64), R_WB, values[:, :3], lookahead_s=lookahead_s)
+        except DatasetError as error:
+            raise DatasetError(f"{path}: {error}") from None
 
     def to_pandas(self) -> pd.DataFrame:
         """Return one row per state: t_ns, R_WB_00.., p_WB_W_x.., and v, b_a, b_g and P_00.. where known."""
@@ -163,14 +170,25 @@ class Trajectory:
 
     @classmethod
     def from_pandas(cls, table: pd.DataFrame, lookahead_s: float = 0.0) -> Trajectory:
-        """Inverse of `to_pandas`."""
+        """Inverse of `to_pandas`.
+
+        Raises:
+            DatasetError: a column is missing, or a time is none.
+        """
+        from .columns import times_ns
+
+        rotation, position = [f"R_WB_{i}{j}" for i in range(3) for j in range(3)], [f"p_WB_W_{a}" for a in "xyz"]
+        absent = [name for name in ("t_ns", *rotation, *position) if name not in table]
+        if absent:
+            raise DatasetError(f"trajectory: missing columns: {', '.join(absent)}")
 
         def vectors(name: str) -> Array | None:
             return table[[f"{name}_{a}" for a in "xyz"]].to_numpy(float) if f"{name}_x" in table else None
 
-        R = np.stack([table[f"R_WB_{i}{j}"].to_numpy(float) for i in range(3) for j in range(3)], axis=1)
-        p = vectors("p_WB_W")
-        assert p is not None
+        t_ns, timed = times_ns(table["t_ns"].to_numpy(), "ns")
+        if not timed.all():
+            row = int(np.flatnonzero(~timed)[0])
+            raise DatasetError(f"trajectory: row {row}: t_ns is {table['t_ns'].iloc[row]}, not a time")
         P = None
         if "P_0_0" in table:
             P = np.empty((len(table), 15, 15))
@@ -178,8 +196,8 @@ class Trajectory:
                 for j in range(i, 15):
                     P[:, i, j] = P[:, j, i] = table[f"P_{i}_{j}"].to_numpy(float)
         return cls(
-            table["t_ns"].to_numpy(np.int64), R.reshape(-1, 3, 3), p, vectors("v_WB_W"), vectors("b_a"), vectors("b_g"),
-            P, lookahead_s,
+            t_ns, table[rotation].to_numpy(float).reshape(-1, 3, 3), table[position].to_numpy(float),
+            vectors("v_WB_W"), vectors("b_a"), vectors("b_g"), P, lookahead_s,
         )  # fmt: skip
 
 
@@ -187,11 +205,14 @@ def seconds_to_ns(text: str) -> int:
     """Convert decimal seconds, as text, to nanoseconds without passing through float64.
 
     Raises:
-        ValueError, OverflowError: not a finite number.
+        ValueError: not a number, or one beyond LIMIT_NS.
     """
-    from decimal import Decimal, InvalidOperation
+    from decimal import Decimal
 
     try:
-        return int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except InvalidOperation:
-        raise ValueError(f"not a time in seconds: {text!r}") from None
+        ns = (Decimal(text) * 1_000_000_000).to_integral_value()
+        if abs(ns) < LIMIT_NS:
+            return int(ns)
+    except ArithmeticError:  # decimal's errors are of this kind
+        pass
+    raise ValueError(f"not a time in seconds: {text[:40]!r}; nanoseconds?")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from pydantic import ValidationError
@@ -34,25 +34,47 @@ class EstimatorError(ValueError):
     """No estimator of that name, or an option that it does not have or cannot take."""
 
 
-def known_estimators() -> dict[str, Any]:
-    """Return our estimators and those that installed packages bring, by name; ours win."""
-    return {point.name: point.load() for point in entry_points(group="fathom.estimators")} | ESTIMATORS
+def known_estimators() -> list[str]:
+    """Return the names of our estimators and of those that installed packages bring."""
+    return sorted(ESTIMATORS.keys() | _plugins().keys())
 
 
-def create(name: str, **options: Any) -> Estimator:
+def load_estimator(name: str) -> Any:
+    """Return the class of the estimator `name`, ours or an installed package's; ours win. Other packages stay unloaded.
+
+    Raises:
+        EstimatorError: unknown name (with the nearest known one), or its package cannot be loaded.
+    """
+    if name in ESTIMATORS:
+        return ESTIMATORS[name]
+    known = known_estimators()
+    if name not in known:
+        raise EstimatorError(f"no estimator {name!r}{nearest(name, known)} (known: {', '.join(known)})")
+    point = _plugins()[name]
+    try:
+        return point.load()
+    except Exception as error:  # whatever somebody's module does when it is imported
+        package = point.dist.name if point.dist else point.value
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        raise EstimatorError(f"{name}: cannot be loaded from the package {package!r}: {what}") from error
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group="fathom.estimators")}
+
+
+def create(name: str, /, **options: Any) -> Estimator:
     """Return the estimator `name`, configured.
 
     Args:
-        name: a key of `known_estimators()`.
+        name: one of `known_estimators()`.
         options: fields of its configuration; the rest keep their defaults.
 
     Raises:
-        EstimatorError: unknown name or option (with the nearest known one), or a value that does not fit.
+        EstimatorError: as `load_estimator`; or unknown option (with the nearest known one), or a value that does not
+            fit.
     """
-    known = ESTIMATORS if name in ESTIMATORS else known_estimators()
-    if name not in known:
-        raise EstimatorError(f"no estimator {name!r}{nearest(name, known)} (known: {', '.join(sorted(known))})")
-    kind = known[name]
+    kind = load_estimator(name)
     fields = list(getattr(kind, "__dataclass_fields__", options))
     for key in options:
         if key not in fields:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,27 @@ def test_a_recording_that_is_not_here_is_said_plainly(tmp_path: Path) -> None:
     assert call("run", file, "--out", tmp_path, "--data", tmp_path, "--only", "ictineu*")[0] == 2
 
 
+def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(tmp_path: Path) -> None:
+    file = write(tmp_path, logs="[{log: ictineu_stpere_2004}]", estimators="[{name: dead-reckoning}]")
+    run = ("run", file, "--out", tmp_path)
+    assert call(*run, "--data", tmp_path)[0] == 2
+    with closing(sqlite3.connect(tmp_path / "short" / "runs.sqlite")) as store, store:
+        store.execute("UPDATE runs SET status = 'done', ate_rmse_m = 1.5, n_scored = 9")
+    code, out, err = call(*run, "--data", tmp_path)
+    assert code == 2
+    assert "1.50" in out
+    assert "its rows are from an earlier run" in err
+
+
+def test_only_leaves_the_others_in_the_csv(tmp_path: Path) -> None:
+    file = write(tmp_path)
+    assert call("run", file, "--out", tmp_path, "--jobs", 2)[0] == 0
+    code, out, _ = call("run", file, "--out", tmp_path, "--jobs", 1, "--only", "eskf")
+    assert code == 0
+    assert "dead-reckoning" not in out
+    assert pd.read_csv(tmp_path / "short" / "table.csv")["label"].tolist() == ["dead-reckoning", "eskf"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -80,6 +102,14 @@ def test_a_recording_that_is_not_here_is_said_plainly(tmp_path: Path) -> None:
         (["simulate", "yoyo", "-o", "{tmp}/x"], "did you mean 'yo-yo'"),
         (["simulate", "{tmp}/none.yaml", "-o", "{tmp}/x"], "none.yaml"),
         (["score", "{tmp}/a.tum", "{tmp}/b.tum"], "a.tum: no such file"),
+        (["score", "{tmp}", "{tmp}/b.tum"], "a folder"),
+        (["score", "/proc/self/mem", "{tmp}/b.tum"], "/proc/self/mem: cannot be read"),
+        (["score", "x" * 300, "{tmp}/b.tum"], "cannot be read"),
+        (["score", "a", "b", "--tolerance-s", "inf"], "--tolerance-s"),
+        (["score", "a", "b", "--delta", "-1"], "delta must be positive"),
+        (["score", "a", "b", "--delta", "nan"], "delta must be positive"),
+        (["score", "a", "b", "--delta", "1.5", "--unit", "frames"], "whole in frames"),
+        (["run", "x" * 300], "no such experiment"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_2_before_anything_runs(tmp_path: Path, arguments: list[str], says: str) -> None:
@@ -94,6 +124,26 @@ def test_bad_input_is_one_line_and_exit_2_before_anything_runs(tmp_path: Path, a
     assert err.count("\n") == 1
     assert not (tmp_path / "r").exists()
     assert not (tmp_path / "x").exists()
+
+
+def test_a_table_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fathom.bench.table.write_table", full)
+    code, _, err = call("run", write(tmp_path), "--out", tmp_path, "--jobs", 1, "--only", "dead*")
+    assert code == 2
+    assert "No space left on device" in err
+    assert err.count("\n") == 1
+
+
+def test_list_says_which_estimator_cannot_be_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    wreck = EntryPoint("wreck", "no_such_module_here:Wreck", "fathom.estimators")
+    monkeypatch.setattr("fathom.estimators.registry._plugins", lambda: {"wreck": wreck})
+    code, out, _ = call("list", "estimators")
+    assert code == 0
+    assert "wreck: cannot be loaded" in out
+    assert "eskf: factors" in out
 
 
 def test_list_names_what_there_is() -> None:
@@ -113,6 +163,14 @@ def test_a_simulated_folder_runs_like_any_log(tmp_path: Path) -> None:
     code, out, _ = call("run", file, "--out", tmp_path, "--jobs", 1)
     assert code == 0
     assert out.startswith("dive")
+
+
+def test_a_simulated_log_without_sensors_is_told_as_it_is(tmp_path: Path) -> None:
+    off = ", ".join(f"{sensor}: null" for sensor in ("dvl", "depth", "gps", "heading"))
+    (tmp_path / "blind.yaml").write_text(f"{{duration_s: 20, {off}}}\n")
+    code, out, _ = call("simulate", tmp_path / "blind.yaml", "-o", tmp_path / "blind")
+    assert code == 0
+    assert out.rstrip().endswith(" 20 s, imu, truth")
 
 
 def test_score_prints_errors_with_their_alignment(tmp_path: Path) -> None:

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import pytest
 from fathom.bench.experiment import Experiment, ExperimentError, shipped_experiments
-from fathom.bench.runner import run_experiment
+from fathom.bench.runner import Worker, run_experiment, work
 from fathom.bench.store import load_runs
 from fathom.bench.table import failures, summarise
 
@@ -109,6 +111,20 @@ def test_the_spec_of_a_run_holds_every_default_and_is_json() -> None:
     assert spec["log"]["duration_s"] == 20.0
     assert spec["log"]["gravity_mps2"] == 9.81
     assert spec["seed"] == 1
+    assert (spec["repair"], spec["log_sha256"]) == (False, None)
+
+
+def test_the_spec_of_a_recorded_run_knows_its_description_and_whether_it_was_repaired(tmp_path: Path) -> None:
+    (tmp_path / "dive").mkdir()
+    (tmp_path / "dive" / "log.yaml").write_text("a: 1\n")
+    plan = experiment(logs=[{"log": str(tmp_path / "dive")}, {"log": "ictineu_stpere_2004"}])
+    dive, ictineu = plan.runs()
+    before = plan.spec(dive, repair=True)
+    assert before["repair"]
+    assert before["log_sha256"] == sha256(b"a: 1\n").hexdigest()
+    assert len(plan.spec(ictineu)["log_sha256"]) == 64
+    (tmp_path / "dive" / "log.yaml").write_text("a: 2\n")
+    assert plan.spec(dive)["log_sha256"] != before["log_sha256"]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +133,7 @@ def test_the_spec_of_a_run_holds_every_default_and_is_json() -> None:
         ({"sedes": [1]}, ["sedes: unknown key 'sedes'", "did you mean 'seeds'"]),
         ({"logs": [SHORT | {"aline": "yaw"}]}, ["logs[0].aline", "did you mean 'align'"]),
         ({"estimators": [{"name": "eskf", "wiht": {}}]}, ["estimators[0].wiht", "did you mean 'with'"]),
-        ({"estimators": [{"name": "eksf"}]}, ["estimators[0]", "no estimator 'eksf'", "did you mean 'eskf'"]),
+        ({"estimators": [{"name": "esfk"}]}, ["estimators[0]", "no estimator 'esfk'", "did you mean 'eskf'"]),
         (
             {"estimators": [{"name": "eskf", "with": {"infalte": {}}}]},
             ["no option 'infalte'", "did you mean 'inflate'"],
@@ -131,6 +147,9 @@ def test_the_spec_of_a_run_holds_every_default_and_is_json() -> None:
         ({"logs": []}, ["logs"]),
         ({"seeds": []}, ["seeds"]),
         ({"seeds": [-1]}, ["seeds[0]", "-1"]),
+        ({"seeds": [2**63]}, ["seeds[0]", "less than"]),
+        ({"scores": {"rpe_delta": 1.5, "rpe_unit": "frames"}}, ["scores", "whole in frames", "1.5"]),
+        ({"scores": {"score_period_s": 1e-12}}, ["scores.score_period_s", "0.001"]),
         ({"seeds": [1, 1]}, ["seed 1", "twice"]),
         ({"scores": {"align": "jaw"}}, ["scores.align", "'jaw'", "yaw"]),
         ({"scores": {"rpe_detla": 1}}, ["scores.rpe_detla", "did you mean 'rpe_delta'"]),
@@ -144,6 +163,12 @@ def test_a_wrong_key_or_value_is_named_with_its_place_and_neighbour(changes: dic
     assert str(caught.value).startswith("t.yaml: ")
     for words in says:
         assert words in str(caught.value)
+
+
+def test_one_mistake_is_one_complaint() -> None:
+    with pytest.raises(ExperimentError) as caught:
+        experiment(estimators=[{"name": "esfk"}])
+    assert "at least 1 item" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -162,6 +187,8 @@ def test_an_unknown_experiment_is_answered_with_the_nearest() -> None:
     with pytest.raises(ExperimentError, match="did you mean 'smoke'"):
         Experiment.load("smoek")
     assert Experiment.load("filter-vs-smoother").name == "filter_vs_smoother"
+    with pytest.raises(ExperimentError, match="no such experiment"):
+        Experiment.load("x" * 300)
 
 
 def test_mishaps_are_rows_and_the_others_go_on(tmp_path: Path, mishap: None) -> None:
@@ -238,3 +265,42 @@ def test_seeds_are_pooled_before_the_root(tmp_path: Path) -> None:
     squared = (rows["ate_rmse_m"] ** 2 * rows["n_scored"]).sum() / rows["n_scored"].sum()
     assert summary["ate_rmse_m"] == pytest.approx(squared**0.5)
     assert summary["ate_rmse_m"] != pytest.approx(rows["ate_rmse_m"].mean())
+
+
+@pytest.mark.parametrize("name", ["figures", "trajectories", "table.csv"])
+def test_what_is_in_the_way_of_results_is_named_before_anything_runs(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "t"
+    if name == "table.csv":
+        (folder / name).mkdir(parents=True)
+    else:
+        folder.mkdir()
+        (folder / name).write_text("in the way")
+    with pytest.raises(ExperimentError, match=name):
+        run_experiment(experiment(), out=tmp_path)
+    assert not (folder / "runs.sqlite").exists()
+
+
+def test_a_worker_is_deaf_to_ctrl_c_from_its_first_moment_and_the_parent_hears_again() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    worker = Worker()
+    try:
+        status = Path(f"/proc/{worker.process.pid}/status").read_text()
+        ignored = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigIgn")), 16)
+        assert ignored & 1 << (signal.SIGINT - 1)
+    finally:
+        worker.kill()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Gone:
+        def recv(self) -> None:
+            return None
+
+        def send(self, rows: object) -> None:
+            raise BrokenPipeError
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("fathom.bench.runner.Bench.execute", lambda bench, task: [])
+    work(Gone())
+    signal.signal(signal.SIGINT, before)

@@ -129,3 +129,39 @@ def test_the_terminals_table_and_the_csv_say_the_same(rows: pd.DataFrame, tmp_pa
     assert "against the truth" in text
     assert "–" in text  # dead reckoning's NEES
     assert "…" not in text
+
+
+def printed(rows: pd.DataFrame, tmp_path: Path, width: int = 100) -> str:
+    with (tmp_path / "terminal").open("w") as file:
+        console = Console(width=width, record=True, file=file)
+        print_table(rows, console)
+    return console.export_text()
+
+
+def test_the_table_says_which_rpe_it_is(rows: pd.DataFrame, tmp_path: Path) -> None:
+    assert "RPE over 10 m, all pairs" in " ".join(printed(rows, tmp_path).split())
+    write_table(rows, tmp_path / "table.csv")
+    table = pd.read_csv(tmp_path / "table.csv")
+    assert table[["rpe_delta", "rpe_unit", "rpe_pairs"]].to_numpy().tolist() == [[10.0, "m", "all"]] * 2
+    assert table["n_scored"].tolist() == rows["n_scored"].tolist()
+    assert table["n_rpe"].tolist() == rows["n_rpe"].tolist()
+
+
+def test_a_label_is_printed_as_it_stands(rows: pd.DataFrame, tmp_path: Path) -> None:
+    text = printed(rows.assign(label="x%[/]y", log="a[/b]"), tmp_path)
+    assert "x%[/]y" in text
+    assert "a[/b]" in text
+
+
+def test_the_widest_label_fits_100_columns(rows: pd.DataFrame, tmp_path: Path) -> None:
+    wide = {"label": "fls preintegrated lag 10", "step_median_us": 22.8, "step_p99_us": 73.5, "real_time_factor": 3566}
+    text = printed(rows.assign(**wide), tmp_path)
+    assert "fls preintegrated lag 10" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_a_log_whose_readings_lay_outside_is_named_with_their_number(rows: pd.DataFrame, tmp_path: Path) -> None:
+    assert "outside the log" not in printed(rows, tmp_path)
+    counts = '{"readings": 100, "readings_outside": 90}'
+    lost = "lawnmower-tactical: 90 of 100 readings lay outside the log"
+    assert printed(rows.assign(counts=counts), tmp_path).count(lost) == 1

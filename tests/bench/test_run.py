@@ -281,6 +281,22 @@ def test_a_jittery_truth_keeps_its_stamps_and_a_sparse_one_gains_none(log: Log) 
     assert score_ticks(sparse, 1.0).tolist() == sparse.truth.t_ns.tolist()
 
 
+def test_an_empty_truth_is_none(log: Log) -> None:
+    assert log.truth is not None
+    blank = replace(log, truth=log.truth.select(slice(0, 0)))
+    assert score_ticks(blank, 1.0).tolist() == score_ticks(replace(log, truth=None), 1.0).tolist()
+    result = run_log(blank, Fake(truthful(log)))
+    assert result.status == "done"
+    assert set(scores(blank, result.online).values()) == {None}
+
+
+def test_readings_are_counted_with_those_outside_the_log(log: Log) -> None:
+    streams = log.streams
+    late = replace(streams["dvl"], received_ns=streams["dvl"].received_ns + 10**15)
+    counts = run_log(replace(log, dvl=late), Fake(truthful(log), factors=frozenset({"dvl"}))).counts
+    assert counts["readings"] == counts["readings_outside"] == len(streams["dvl"])
+
+
 def test_scores_that_a_buoys_truth_cannot_give_are_absent(log: Log) -> None:
     assert log.truth is not None
     p = log.truth.p_WB_W.copy()

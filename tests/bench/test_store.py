@@ -49,6 +49,16 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         assert store.read()["ate_rmse_m"].tolist() == [1.5]
 
 
+def test_a_run_that_cannot_be_made_keeps_what_an_earlier_one_left(tmp_path: Path) -> None:
+    absent = {"status": "absent", "ate_rmse_m": None}
+    with Store(tmp_path / "runs.sqlite") as store:
+        store.write([row(seed=None), row(seed=None, output="hindsight")])
+        assert not store.write_absent(row(seed=None, **absent))
+        assert store.write_absent(row(label="new", **absent))
+        assert store.write_absent(row(label="new", **absent))
+        assert store.read()["status"].tolist() == ["done", "done", "absent"]
+
+
 def test_two_rows_of_one_name_cannot_be(tmp_path: Path) -> None:
     with Store(tmp_path / "runs.sqlite") as store, pytest.raises(sqlite3.IntegrityError):
         store.write([row(seed=None), row(seed=None)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from fathom.datasets import Belief, DatasetError, ImuNoise, Log, Mounting, NavState, Rig, Trajectory
+from fathom.datasets.conversion import _stray
 from fathom.datasets.folder import write_folder
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream
 from fathom.datasets.opening import RecordingNotFound, catalog_names, open_log
@@ -129,6 +131,7 @@ def some_log(seed: int, *, attitude: bool = False) -> Log:
     P = P + P.transpose(0, 2, 1)
     truth = Trajectory(times(n), R, *(rng.normal(size=(n, 3)) for _ in range(4)), P, lookahead_s=np.inf)
     state = NavState(R[0], *(rng.normal(size=3) for _ in range(4)))
+    root = rng.normal(size=(15, 15))
     return Log(
         name="some: log",
         rig=Rig(ImuNoise(*rng.uniform(1e-6, 1, 6)), mounting(), mounting(), mounting(), mounting(), 9.8123456789),
@@ -139,7 +142,7 @@ def some_log(seed: int, *, attitude: bool = False) -> Log:
         heading=stream(AttitudeStream if attitude else HeadingStream, 6),
         truth=truth,
         truth_kind="reference",
-        prior=Belief(t0, state, rng.normal(size=(15, 15))),
+        prior=Belief(t0, state, root @ root.T),
         notes=("one: of ümlauts, 'quotes'", "two"),
         origin=(41.123456789012345, -8.7),
     )
@@ -317,6 +320,8 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"truth": {"trajectory": "gps.csv"}}, r"gps.csv"),
     ({"gravity": -9.81}, r"gravity must be in m/s² and positive"),
     ({"origin": {"latitude_deg": 91, "longitude_deg": 0}}, r"origin.latitude_deg"),
+    ({"streams.dvl.time.clock_offset_s": 1e300}, r"streams.dvl.time.clock_offset_s.*less than"),
+    ({"streams.dvl.time.delay_s": 1e300}, r"streams.dvl.time.delay_s.*less than"),
 ]
 
 
@@ -432,6 +437,213 @@ def test_a_description_elsewhere_describes_files_in_place(folder, tmp_path_facto
     away = tmp_path_factory.mktemp("away") / "mine.yaml"
     away.write_text((folder / "log.yaml").read_text())
     assert len(open_log(away, folder).imu.t_ns) == 20
+
+
+def test_bytes_of_utf16_are_called_so(folder):
+    (folder / "depth.csv").write_text("counts\n20\n", encoding="utf-16")
+    with pytest.raises(DatasetError, match=r"depth.csv: byte 0 is not utf-8; set `encoding` \(utf-16\?\)"):
+        open_log(folder)
+    describe(folder, {"streams.depth.table.encoding": "utf-16"})
+    assert len(open_log(folder).streams["depth"]) == 1
+
+
+def test_a_folder_that_holds_a_log_is_not_written_over(tmp_path):
+    log = some_log(8)
+    (tmp_path / "gps.parquet").write_text("mine")
+    with pytest.raises(DatasetError, match=r"holds a gps.parquet already"):
+        write_folder(log, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["gps.parquet"]
+    (tmp_path / "gps.parquet").unlink()
+    write_folder(log, tmp_path, "csv")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(DatasetError, match=r"holds a log.yaml already"):
+        write_folder(some_log(9), tmp_path)
+    assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
+
+
+PRIOR: dict[str, Any] = {
+    "t_ns": 100 * 10**9,
+    "R_WB": np.eye(3).tolist(),
+    **{name: [0.0, 0.0, 0.0] for name in ("p_WB_W", "v_WB_W", "b_a", "b_g")},
+    "P": np.diag([1e-6, 0.0, 1e6] * 5).tolist(),
+}
+
+
+def damaged(row: int, column: int, value: float) -> Any:
+    P = np.array(PRIOR["P"])
+    P[row, column] = value
+    return P.tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"R_WB": np.diag([1.0, 1.0, -1.0]).tolist()}, "R_WB is not a rotation"),
+        ({"P": damaged(0, 0, -1e-6)}, "P is not symmetric and positive semi-definite"),
+        ({"P": damaged(0, 2, 0.1)}, "P is not symmetric and positive semi-definite"),
+        ({"P": (1e-6 * (2 * np.eye(15) - 1)).tolist()}, "P is not symmetric and positive semi-definite"),
+        ({"P": damaged(3, 3, float("nan"))}, "prior.P.3.3"),
+        ({"t_ns": 10**30}, "prior.t_ns"),
+        ({"t_ns": 102 * 10**9}, r"prior: t_ns, 102.000 s, lies outside the IMU's time, 100.000 s to 101.900 s"),
+        ({"t_ns": 99 * 10**9}, r"prior: t_ns, 99.000 s, lies outside the IMU's time"),
+    ],
+)
+def test_a_prior_that_cannot_be_is_refused_and_one_with_zeros_is_not(folder, change, message):
+    describe(folder, {"prior": PRIOR})
+    prior = open_log(folder).prior
+    assert prior is not None
+    np.testing.assert_array_equal(prior.P, PRIOR["P"])
+    describe(folder, {"prior": PRIOR | change})
+    with pytest.raises(DatasetError, match=message):
+        open_log(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"streams.dvl.time.clock_offset_s": 1000.0},
+            "dvl: 1099.250 s to 1100.250 s lies wholly outside the IMU's time",
+        ),
+        ({"streams.heading.time.unit": "ms"}, "heading: 0.100 s to 0.101 s lies wholly outside the IMU's time"),
+        ({"truth": {"tum": "late.tum"}}, "truth: 1100.500 s to 1101.500 s lies wholly outside the IMU's time"),
+    ],
+)
+def test_a_clock_that_shares_no_time_with_the_imu_is_refused(folder, changes, message):
+    (folder / "late.tum").write_text("1100.5 1 2 3 0 0 0 1\n1101.5 2 2 3 0 0 1 0\n")
+    describe(folder, changes)
+    with pytest.raises(DatasetError, match=message + r", 100.000 s to 101.900 s; .*clock_offset_s.*unit") as error:
+        open_log(folder)
+    assert str(error.value).startswith(str(folder))
+
+
+def test_a_truth_without_rows_is_refused(folder):
+    (folder / "empty.csv").write_text("t,x,y,z\n")
+    position = {"columns": ["x", "y", "z"], "unit": "m"}
+    describe(folder, {"truth": {"table": {"file": "empty.csv"}, "time": {"column": "t"}, "position": position}})
+    with pytest.raises(DatasetError, match=r"truth: no rows"):
+        open_log(folder)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("R_WB_00", 5.0, r"truth.csv: row 3 \(1 in all\): R_WB is not a rotation"),
+        ("R_WB_00", np.nan, r"truth.csv: row 3 \(1 in all\): R_WB is not a rotation"),
+        ("t_ns", np.nan, r"truth.csv: trajectory: row 3: t_ns is nan, not a time"),
+        ("t_ns", -9e18, r"truth.csv: trajectory: row 3: t_ns is -9e\+18, not a time"),
+        ("p_WB_W_x", None, r"truth.csv: trajectory: missing columns: p_WB_W_x"),
+    ],
+)
+def test_a_truth_of_ours_that_cannot_be_is_refused(folder, column, value, message):
+    truth = some_log(6).truth
+    assert truth is not None
+    table = truth.to_pandas()
+    if value is None:
+        table = table.drop(columns=column)
+    else:
+        table[column] = table[column].astype(float)
+        table.loc[3, column] = value
+    table.to_csv(folder / "truth.csv", index=False)
+    describe(folder, {"truth": {"trajectory": "truth.csv"}})
+    with pytest.raises(DatasetError, match=message):
+        open_log(folder)
+
+
+def test_a_truth_of_ours_may_leave_attitudes_unknown(folder):
+    t_ns = np.array([100, 101]) * 10**9
+    truth = Trajectory(t_ns, np.stack([np.eye(3), np.full((3, 3), np.nan)]), np.zeros((2, 3)))
+    truth.to_pandas().to_csv(folder / "truth.csv", index=False)
+    describe(folder, {"truth": {"trajectory": "truth.csv"}})
+    opened = open_log(folder).truth
+    assert opened is not None
+    np.testing.assert_array_equal(opened.R_WB, truth.R_WB)
+
+
+def test_a_difference_of_times_that_overflows_is_still_out_of_order():
+    t_ns = np.array([9 * 10**18, -9 * 10**18])
+    with pytest.raises(DatasetError, match="row 1: time -9000000000000000000 is not after"):
+        Trajectory(t_ns, np.stack([np.eye(3)] * 2), np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("row", [0, 5, 19])
+def test_one_spike_in_time_costs_one_row(folder, row):
+    lines = FILES["imu.txt"].splitlines()
+    stamp, rest = lines[row + 1].split("\t")
+    lines[row + 1] = f"{float(stamp) + (1000 if row < 19 else -1000):.3f}\t{rest}"
+    (folder / "imu.txt").write_text("\n".join(lines))
+    how = "is ahead of rows below" if row < 19 else "comes before the row above"
+    with pytest.raises(DatasetError, match=rf"imu: row {row} \(1 in all\): time -?\d+ ns {how}"):
+        open_log(folder)
+    log = open_log(folder, repair=True)
+    expected = np.delete(100 * 10**9 + np.arange(20) * 10**8, row)
+    np.testing.assert_array_equal(log.imu.t_ns, expected)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_more_rows_are_dropped_for_order_than_must_be(seed):
+    t_ns = np.random.default_rng(seed).integers(0, 9, 9)
+    left = t_ns[~_stray(t_ns)]
+    assert (np.diff(left) > 0).all()
+    runs = (c for k in range(len(left) + 1, 10) for c in itertools.combinations(t_ns.tolist(), k))
+    assert not any(all(a < b for a, b in itertools.pairwise(run)) for run in runs)
+
+
+def test_times_that_run_backwards_are_no_repair(folder):
+    lines = FILES["imu.txt"].splitlines()
+    (folder / "imu.txt").write_text("\n".join([lines[0], *reversed(lines[1:])]))
+    with pytest.raises(DatasetError, match="imu: 19 of 20 rows are out of order, too many to drop"):
+        open_log(folder, repair=True)
+
+
+def test_repeated_rows_are_repaired_however_many_they_are(folder):
+    (folder / "heading.csv").write_text("t,deg\n" + "".join(f"{100 + i // 5},3\n" for i in range(10)))
+    assert len(open_log(folder, repair=True).streams["heading"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1403636579763555584 0 0 0 0 0 0 1", "line 1: not a time in seconds: '1403636579763555584'; nanoseconds?"),
+        ("1e999999999 0 0 0 0 0 0 1", "line 1: not a time in seconds: '1e999999999'"),
+        ("nan 0 0 0 0 0 0 1", "line 1: not a time in seconds: 'nan'"),
+        ("soon 0 0 0 0 0 0 1", "line 1: not numbers: 'soon"),
+        ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1", "trajectory: row 1: time 1000000000 is not after the row above"),
+    ],
+)
+def test_what_is_wrong_in_a_tum_file_names_the_file(tmp_path, text, message):
+    path = tmp_path / "a.tum"
+    path.write_text(text)
+    with pytest.raises(DatasetError) as error:
+        Trajectory.from_tum(path)
+    assert str(error.value).startswith(f"{path}: {message}")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("none.tum", "no such file"),
+        ("", "cannot be read: Is a directory"),
+        ("x" * 300, "cannot be read: File name too long"),
+        ("a\0b", "cannot be read: embedded null byte"),
+    ],
+)
+def test_a_tum_file_that_cannot_be_read_is_one_line(tmp_path, name, why):
+    with pytest.raises(DatasetError) as error:
+        Trajectory.from_tum(tmp_path / name)
+    assert str(error.value) == f"{tmp_path / name}: {why}"
+
+
+def test_errors_of_the_rig_and_the_imu_name_the_log(folder):
+    describe(folder, {"gravity": 1.0})
+    with pytest.raises(DatasetError) as error:
+        open_log(folder)
+    assert str(error.value).startswith(f"{folder}: rig: gravity")
+    describe(folder, {})
+    (folder / "imu.txt").write_text(FILES["imu.txt"].splitlines()[1])
+    with pytest.raises(DatasetError) as error:
+        open_log(folder)
+    assert str(error.value).startswith(f"{folder}: imu: 1 samples")
 
 
 def log_or_error(folder: Path, *, repair: bool = False) -> None:

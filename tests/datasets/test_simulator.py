@@ -350,7 +350,7 @@ def test_times_are_exact_integers(start_ns):
 def test_every_duration_makes_a_log_that_can_be_cut(mission, duration_s):
     voyage = cut(simulate(Scenario(mission=mission, duration_s=duration_s), 9))
     assert voyage.failure is None
-    assert voyage.counts == {"imu_gaps_bridged": 0, "readings_outside": 0}
+    assert not any(voyage.counts.values())
 
 
 def test_the_log_says_what_it_is():
