@@ -204,7 +204,7 @@ class GraphPass:
         new = []
         for k in np.argsort(readings["t_ns"], kind="stable").tolist():
             reading = readings[k : k + 1]
-            kind, t_ns = int(reading["kind"][0]), int(reading["t_ns"][0])
+            kind, t_ns = int(reading["kind"][0]), _time_of(reading)
             if np.isinf(self._inflate[kind]) or not np.isfinite(reading["sigma"]).any():
                 continue
             if kind == DVL:
@@ -253,7 +253,7 @@ class GraphPass:
         self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
         pending, self._pending = self._pending, []
         for reading in pending:
-            at_ns = int(reading["t_ns"][0])
+            at_ns = _time_of(reading)
             if at_ns > t_ns + self._config.merge_ns:
                 self._pending.append(reading)
             elif self._config.preintegrates and int(reading["kind"][0]) == DVL:
@@ -296,7 +296,7 @@ class GraphPass:
 
     def _add_reading(self, keyframe: Keyframe, reading: NDArray[Any]) -> None:
         """Add the factor of a reading on `keyframe`, carried by the IMU where it was true later."""
-        t_ns = int(reading["t_ns"][0])
+        t_ns = _time_of(reading)
         if abs(t_ns - keyframe.t_ns) <= self._config.merge_ns:
             self.counts["merged"] += int(t_ns != keyframe.t_ns)
             self._graph.add(reading_factor(keyframe.index, reading, self._rig))
@@ -308,7 +308,7 @@ class GraphPass:
 
     def _sum_or_use(self, last: Keyframe, new: Keyframe, reading: NDArray[Any]) -> None:
         """Keep a DVL reading for the interval that it begins or lies in; at a keyframe, by velocity if asked for."""
-        at_new = abs(int(reading["t_ns"][0]) - new.t_ns) <= self._config.merge_ns
+        at_new = abs(_time_of(reading) - new.t_ns) <= self._config.merge_ns
         if at_new and "velocity" in self._config.dvl:
             self._add_reading(new, reading)
         elif at_new:
@@ -345,11 +345,9 @@ class GraphPass:
 
     def _block(self, keyframe: Keyframe, state: NavState, t_ns: int) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the keyframe's state as a record, and the block from it to t_ns."""
+        assert keyframe.before is not None
         block = np.zeros(1, BLOCK)
         record = as_record(Belief(keyframe.t_ns, state, np.zeros((15, 15))))
-        if keyframe.before is None:  # nothing has been lived through yet
-            block["dR"] = np.eye(3)
-            return record, block
         head, _ = split(keyframe.imu, t_ns)
         integrate(head, keyframe.before, state.b_a, state.b_g, self._rig, block)
         return record, block
