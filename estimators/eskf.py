@@ -13,12 +13,11 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import THETA, Array, Belief
 from .filter_pass import FilterOptions, FilterPass
 from .imu import integrate, predict, process_noise, sandwich
-from .measurements import measure
+from .measurements import decorrelate, measure
 from .so3 import exp, product, right_jacobian
 
 
@@ -31,29 +30,7 @@ class ErrorStateKalmanFilter(FilterOptions):
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
-        return FilterPass(self, prior, rig, advance)
-
-
-def advance(state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], epoch: Epoch, block: NDArray[Any]) -> bool:
-    """See `Advance`."""
-    return filter_step(state, rig, before, epoch.imu, epoch.readings, block)
-
-
-@njit(cache=True)
-def filter_step(
-    state: NDArray[Any],
-    rig: NDArray[Any],
-    before: NDArray[Any],
-    imu: NDArray[Any],
-    readings: NDArray[Any],
-    block: NDArray[Any],
-) -> bool:
-    """One epoch of the filter, in place on `state`; False where it diverged."""
-    if len(imu) > 0:
-        propagate(state, rig, before, imu, block)
-    if len(readings) > 0:
-        return correct(state, rig, readings)
-    return True
+        return FilterPass(self, prior, rig, ErrorStateKalman())
 
 
 @njit(cache=True)
@@ -117,21 +94,6 @@ def absorb(n: int, r: Array, H: Array, C: Array, P: Array, dx: Array) -> bool:
 
 
 @njit(cache=True)
-def decorrelate(n: int, r: Array, H: Array, C: Array) -> None:
-    """Subtract from each of the first n rows what the rows before it say of its error: C becomes diagonal (L D Lᵀ)."""
-    for k in range(n):
-        for i in range(k + 1, n):
-            if C[i, k] != 0.0:
-                share = C[i, k] / C[k, k]
-                r[i] -= share * r[k]
-                for j in range(15):
-                    H[i, j] -= share * H[k, j]
-                for j in range(k + 1, n):
-                    C[i, j] -= share * C[k, j]
-                C[i, k] = 0.0
-
-
-@njit(cache=True)
 def inject(state: NDArray[Any], dx: Array) -> None:
     """x ← x ⊕ dx, and P for the error that is left: theta ← J_r(dtheta) (theta − dtheta)."""
     s = state[0]
@@ -149,3 +111,15 @@ def inject(state: NDArray[Any], dx: Array) -> None:
     for i in range(15):
         for j in range(i):
             s.P[i, j] = s.P[j, i] = 0.5 * (s.P[i, j] + s.P[j, i])
+
+
+class ErrorStateKalman:
+    """See `Kalman`: the functions of this module."""
+
+    predict = staticmethod(propagate)
+    correct = staticmethod(correct)
+
+    @staticmethod
+    def error_covariance(state: NDArray[Any]) -> Array:
+        """P is of our error state."""
+        return state["P"][0]

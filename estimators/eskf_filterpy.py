@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, Array, Belief
 from .eskf import inject
@@ -27,31 +26,51 @@ class FilterpyKalmanFilter(FilterOptions):
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
-        return FilterPass(self, prior, rig, advance)
+        return FilterPass(self, prior, rig, FilterpyKalman())
 
 
-def advance(state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], epoch: Epoch, block: NDArray[Any]) -> bool:
-    """See `Advance`."""
-    from filterpy.kalman import ExtendedKalmanFilter  # slow to import, and no other command needs it
+class FilterpyKalman:
+    """See `Kalman`."""
 
-    ekf = ExtendedKalmanFilter(dim_x=DIM, dim_z=1)
-    ekf.x, ekf.P = np.zeros(DIM), state[0]["P"].copy()
-    if len(epoch.imu):
-        R_i = state[0]["R_WB"].copy()
-        integrate(epoch.imu, before, state[0]["b_a"], state[0]["b_g"], rig, block)
+    def __init__(self) -> None:
+        from filterpy.kalman import ExtendedKalmanFilter  # slow to import, and no other command needs it
+
+        self._filter = ExtendedKalmanFilter
+
+    def predict(
+        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
+    ) -> None:
+        """See `Kalman.predict`."""
+        ekf, R_i = self._about(state), state[0]["R_WB"].copy()
+        integrate(imu, before, state[0]["b_a"], state[0]["b_g"], rig, block)
         predict(block, state, rig[0]["gravity"], ekf.F, state)
         process_noise(block, R_i, ekf.Q)
         ekf.predict()
-    r, H, C = stack(state, rig, epoch.readings)
-    if len(r):
-        try:
-            ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
-            np.linalg.cholesky(ekf.S)
-        except (np.linalg.LinAlgError, ValueError):  # scipy's way of saying that something is not finite
-            return False
-    state[0]["P"] = ekf.P
-    inject(state, ekf.x)
-    return bool(np.isfinite(ekf.x).all())
+        state[0]["P"] = ekf.P
+
+    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
+        """See `Kalman.correct`."""
+        ekf = self._about(state)
+        r, H, C = stack(state, rig, readings)
+        if len(r):
+            try:
+                ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
+                np.linalg.cholesky(ekf.S)
+            except (np.linalg.LinAlgError, ValueError):  # scipy's way of saying that something is not finite
+                return False
+        state[0]["P"] = ekf.P
+        inject(state, ekf.x)
+        return bool(np.isfinite(ekf.x).all())
+
+    def error_covariance(self, state: NDArray[Any]) -> Array:
+        """P is of our error state."""
+        return state["P"][0]
+
+    def _about(self, state: NDArray[Any]) -> Any:
+        """Return filterpy's filter of the state's error, which is zero."""
+        ekf = self._filter(dim_x=DIM, dim_z=1)
+        ekf.x, ekf.P = np.zeros(DIM), state[0]["P"].copy()
+        return ekf
 
 
 def stack(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> tuple[Array, Array, Array]:

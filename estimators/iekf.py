@@ -27,10 +27,8 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, POSITION, THETA, VELOCITY, Array, Belief
-from ..datasets.trajectory import Trajectory
 from .eskf import absorb
 from .filter_pass import FilterOptions, FilterPass
 from .imu import integrate, predict, process_noise, sandwich
@@ -45,40 +43,33 @@ PHI, RHO, NU = THETA, POSITION, VELOCITY
 class InvariantKalmanFilter(FilterOptions):
     """Right-invariant extended Kalman filter over SE_2(3) and biases."""
 
-    def begin(self, prior: Belief, rig: Rig) -> InvariantPass:
+    def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
-        return InvariantPass(self, prior, rig)
+        kalman, x = InvariantKalman(prior.state.p_WB_W.copy()), prior.state
+        P = sandwich(to_invariant(x.R_WB, np.zeros(3), x.v_WB_W), prior.P)
+        return FilterPass(self, Belief(prior.t_ns, x, P), rig, kalman)
 
 
-class InvariantPass:
-    """One pass of `InvariantKalmanFilter`; inside, every P is of the invariant error."""
+class InvariantKalman:
+    """See `Kalman`; every P is of the invariant error, and positions are counted from the origin (3,)."""
 
-    def __init__(self, config: InvariantKalmanFilter, prior: Belief, rig: Rig) -> None:
-        self._origin = prior.state.p_WB_W.copy()
-        self._filter = FilterPass(config, self._reexpress(to_invariant, prior), rig, self._advance)
-        self.counts = self._filter.counts
+    def __init__(self, origin: Array) -> None:
+        self._origin = origin
 
-    def step(self, epoch: Epoch) -> None:
-        """See `Pass.step`."""
-        self._filter.step(epoch)
+    def predict(
+        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
+    ) -> None:
+        """See `Kalman.predict`."""
+        propagate_invariant(state, rig, before, imu, block, self._origin)
 
-    def belief(self) -> Belief:
-        """See `Pass.belief`. (The rate noise that the filter adds to v is the same in nu.)"""
-        return self._reexpress(from_invariant, self._filter.belief())
+    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
+        """See `Kalman.correct`."""
+        return correct_invariant(state, rig, readings, self._origin)
 
-    def finish(self) -> Trajectory | None:
-        """A filter has no hindsight."""
-        return None
-
-    def _advance(
-        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], epoch: Epoch, block: NDArray[Any]
-    ) -> bool:
-        """See `Advance`."""
-        return invariant_step(state, rig, before, epoch.imu, epoch.readings, block, self._origin)
-
-    def _reexpress(self, conversion: Any, belief: Belief) -> Belief:
-        x = belief.state
-        return Belief(belief.t_ns, x, sandwich(conversion(x.R_WB, x.p_WB_W - self._origin, x.v_WB_W), belief.P))
+    def error_covariance(self, state: NDArray[Any]) -> Array:
+        """See `Kalman.error_covariance`. (The rate noise that a belief adds to v is the same in nu.)"""
+        s = state[0]
+        return sandwich(from_invariant(s["R_WB"], s["p_WB_W"] - self._origin, s["v_WB_W"]), s["P"])
 
 
 @njit(cache=True)
@@ -99,19 +90,6 @@ def from_invariant(R_WB: Array, p_OB_W: Array, v_WB_W: Array) -> Array:
     A[POSITION, PHI] = -skew(p_OB_W)
     A[VELOCITY, PHI] = -skew(v_WB_W)
     return A
-
-
-@njit(cache=True)
-def invariant_step(
-    state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], readings: NDArray[Any],
-    block: NDArray[Any], origin: Array,
-) -> bool:  # fmt: skip
-    """One epoch of the filter, in place on `state`, whose P is of the invariant error; False where it diverged."""
-    if len(imu) > 0:
-        propagate_invariant(state, rig, before, imu, block, origin)
-    if len(readings) > 0:
-        return correct_invariant(state, rig, readings, origin)
-    return True
 
 
 @njit(cache=True)

@@ -33,10 +33,17 @@ def _inflate(factor_by_sensor: dict[str, float]) -> dict[str, float]:
     return factor_by_sensor
 
 
+def _gate(probability_by_sensor: dict[str, float]) -> dict[str, float]:
+    _known(probability_by_sensor, FACTORS)
+    return probability_by_sensor
+
+
 Factors = Annotated[frozenset[str], AfterValidator(_factors)]
 """Which aiding sensors an estimator may use."""
 Inflation = Annotated[dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]], AfterValidator(_inflate)]
 """Factor on the stated sigma by sensor; also "gyro" and "accel"."""
+Gate = Annotated[dict[str, Annotated[float, Field(gt=0, lt=1)]], AfterValidator(_gate)]
+"""Probability by sensor: a reading that an honest filter would find less likely than all but this share is left out."""
 
 
 class Diverged(RuntimeError):  # noqa: N818 - the run's status, by its name

@@ -147,3 +147,18 @@ def measure(
             C[n, n] += spread**2
             n += 1
     return n
+
+
+@njit(cache=True)
+def decorrelate(n: int, r: Array, H: Array, C: Array) -> None:
+    """Subtract from each of the first n rows what the rows before it say of its error: C becomes diagonal (L D Lᵀ)."""
+    for k in range(n):
+        for i in range(k + 1, n):
+            if C[i, k] != 0.0:
+                share = C[i, k] / C[k, k]
+                r[i] -= share * r[k]
+                for j in range(15):
+                    H[i, j] -= share * H[k, j]
+                for j in range(k + 1, n):
+                    C[i, j] -= share * C[k, j]
+                C[i, k] = 0.0

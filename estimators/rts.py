@@ -25,7 +25,7 @@ from ..datasets.epochs import Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, THETA, Array, Belief
 from ..datasets.trajectory import Trajectory
-from .eskf import filter_step, inject
+from .eskf import ErrorStateKalman, inject
 from .filter_pass import FilterOptions, FilterPass
 from .imu import BLOCK, STATE, predict, process_noise, sandwich
 from .interface import Diverged
@@ -61,7 +61,7 @@ class RauchTungStriebelPass:
     """One pass of `RauchTungStriebelSmoother`."""
 
     def __init__(self, config: RauchTungStriebelSmoother, prior: Belief, rig: Rig) -> None:
-        self._forwards = FilterPass(config, prior, rig, self._advance)
+        self._forwards = FilterPass(config, prior, rig, ErrorStateKalman(), self._remember_epoch)
         self.counts = self._forwards.counts
         self._pages: list[Page] = []
         self._length = 0
@@ -94,21 +94,18 @@ class RauchTungStriebelPass:
         self._length = 0
         return Trajectory.from_beliefs(beliefs[::-1], lookahead_s=np.inf)
 
-    def _advance(
-        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], epoch: Epoch, block: NDArray[Any]
-    ) -> bool:
-        """See `Advance`."""
-        if not filter_step(state, rig, before, epoch.imu, epoch.readings, block):
-            return False
-        self._remember(epoch.t_ns, epoch.tick, state, block if len(epoch.imu) else STANDSTILL)
-        return True
+    def _remember_epoch(self, epoch: Epoch, state: NDArray[Any], block: NDArray[Any]) -> None:
+        """Write an epoch down; where nothing moved since the last one, as the same, later known better."""
+        t_ns, tick = epoch.t_ns, epoch.tick
+        if not len(epoch.imu):
+            self._forget(t_ns + 1)
+            page, row = self._pages[-1], (self._length - 1) % PAGE
+            block, tick = page.block[row : row + 1].copy(), tick or bool(page.tick[row])
+        self._remember(t_ns, tick, state, block)
 
     def _remember(self, t_ns: int, tick: bool, state: NDArray[Any], block: NDArray[Any]) -> None:
-        """Write an epoch down; where the filter has gone back for a late reading, over those that it lives again."""
-        while self._length and self._pages[-1].t_ns[(self._length - 1) % PAGE] >= t_ns:
-            self._length -= 1
-            if self._length % PAGE == 0:
-                self._pages.pop()
+        """Write a state down; where the filter has gone back for a late reading, over those that it lives again."""
+        self._forget(t_ns)
         row = self._length % PAGE
         if row == 0:
             self._pages.append(Page())
@@ -116,6 +113,13 @@ class RauchTungStriebelPass:
         page.t_ns[row], page.tick[row], page.block[row] = t_ns, tick, block[0]
         keep(state, row, page.mean, page.P)
         self._length += 1
+
+    def _forget(self, t_ns: int) -> None:
+        """Strike out what was written down of t_ns and later."""
+        while self._length and self._pages[-1].t_ns[(self._length - 1) % PAGE] >= t_ns:
+            self._length -= 1
+            if self._length % PAGE == 0:
+                self._pages.pop()
 
 
 STANDSTILL = np.zeros(1, BLOCK)

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, THETA, Array, Belief
 from .eskf import inject
 from .filter_pass import FilterOptions, FilterPass
 from .imu import integrate, predict, process_noise
+from .interface import Diverged
 from .measurements import measure
 from .so3 import exp, log, product
 
@@ -47,11 +47,11 @@ class UnscentedKalmanFilter(FilterOptions):
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
-        return FilterPass(self, prior, rig, UnscentedAdvance(self.alpha, self.beta))
+        return FilterPass(self, prior, rig, UnscentedKalman(self.alpha, self.beta))
 
 
-class UnscentedAdvance:
-    """The unscented filter's `Advance`, with its points and weights."""
+class UnscentedKalman:
+    """See `Kalman`; holds the points and their weights."""
 
     def __init__(self, alpha: float, beta: float) -> None:
         from filterpy.kalman import MerweScaledSigmaPoints, unscented_transform  # slow to import
@@ -59,41 +59,46 @@ class UnscentedAdvance:
         self._points = MerweScaledSigmaPoints(DIM, alpha, beta, kappa=0.0, sqrt_method=_upper_root)
         self._transform = unscented_transform
 
-    def __call__(
-        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], epoch: Epoch, block: NDArray[Any]
-    ) -> bool:
-        """See `Advance`."""
-        try:
-            if len(epoch.imu):
-                self._propagate(state, rig, before, epoch.imu, block)
-            if len(epoch.readings):
-                self._correct(state, rig, epoch.readings)
-        except np.linalg.LinAlgError:
-            return False
-        return bool(np.isfinite(state[0]["P"]).all())
-
-    def _propagate(
+    def predict(
         self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
     ) -> None:
         """x ← the mean of f over the points, P ← their covariance and Q."""
-        points = self._points.sigma_points(np.zeros(DIM), state[0]["P"])
-        Q = np.empty((DIM, DIM))
+        points, Q = self._sigma_points(state), np.empty((DIM, DIM))
         errors = carry_points(points, state, rig, before, imu, block, Q)
         mean, state[0]["P"] = self._transform(errors, self._points.Wm, self._points.Wc, Q)
         inject(state, mean)
 
-    def _correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> None:
+    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
         """x ← x ⊕ K (0 − mean residual), P ← P − K S Kᵀ, by all readings together."""
-        points = self._points.sigma_points(np.zeros(DIM), state[0]["P"])
+        points = self._sigma_points(state)
         residuals, C = measure_points(points, state, rig, readings)
         if not residuals.shape[1]:
-            return
+            return True
         mean, S = self._transform(residuals, self._points.Wm, self._points.Wc, C)
         cross = points.T @ (self._points.Wc[:, None] * (residuals - mean))
-        np.linalg.cholesky(S)
+        try:
+            np.linalg.cholesky(S)
+        except np.linalg.LinAlgError:
+            return False
         K = np.linalg.solve(S, cross.T).T
         state[0]["P"] -= K @ S @ K.T
         inject(state, -K @ mean)
+        return bool(np.isfinite(state[0]["P"]).all())
+
+    def error_covariance(self, state: NDArray[Any]) -> Array:
+        """P is of our error state."""
+        return state["P"][0]
+
+    def _sigma_points(self, state: NDArray[Any]) -> Array:
+        """Return the points (31, 15), errors about the state.
+
+        Raises:
+            Diverged: P is no covariance.
+        """
+        try:
+            return self._points.sigma_points(np.zeros(DIM), state[0]["P"])
+        except np.linalg.LinAlgError:
+            raise Diverged("the covariance is not positive, and has no sigma points") from None
 
 
 def _upper_root(P: Array) -> Array:

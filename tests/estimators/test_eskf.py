@@ -13,7 +13,7 @@ from fathom.datasets.epochs import DEPTH, DVL, GPS, Epoch, cut
 from fathom.datasets.scenario import DvlSpec, GpsSpec, HeadingSpec, Scenario
 from fathom.datasets.simulator import simulate
 from fathom.estimators import Diverged, create
-from fathom.estimators.eskf import decorrelate
+from fathom.estimators.measurements import decorrelate
 from paths import NOISE, reading
 from scipy.stats import chi2
 

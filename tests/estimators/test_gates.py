@@ -1,0 +1,96 @@
+"""Gates leave out what an honest filter would not believe, no more than they were told to, and count it once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fathom.bench.metrics import ate
+from fathom.bench.run import run_log
+from fathom.datasets import Belief, Log
+from fathom.datasets.epochs import KIND, READING
+from fathom.datasets.log import GpsStream
+from fathom.datasets.scenario import DvlSpec, Scenario
+from fathom.datasets.simulator import simulate
+from fathom.estimators import create
+from fathom.estimators.eskf_filterpy import stack
+from fathom.estimators.imu import compile_rig
+from fathom.estimators.innovation import gate_widths, normalised_innovations
+from fathom.estimators.interface import FACTORS
+from fathom.estimators.records import as_record
+from paths import random_rig, random_state
+from scipy.stats import binom, chi2
+
+FILTERS = ["eskf", "eskf-filterpy", "iekf", "ukf", "rts"]
+
+
+def with_gps_outliers(log: Log, every: int, by_m: float) -> tuple[Log, Log, int]:
+    """The log with every so many-th fix thrown sideways, without those fixes, and how many came before its end."""
+    gps, bad = log.gps, np.arange(len(log.gps)) % every == every - 1
+    z = gps.z + bad[:, None] * [by_m, 0.0, 0.0]
+    dirty = GpsStream(gps.t_ns, gps.received_ns, z, gps.sigma)
+    sparse = GpsStream(gps.t_ns[~bad], gps.received_ns[~bad], gps.z[~bad], gps.sigma[~bad])
+    heard = int((bad & (gps.received_ns <= log.imu.t_ns[-1])).sum())
+    return replace(log, gps=dirty), replace(log, gps=sparse), heard
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_normalised_innovations_are_those_of_the_textbook(seed: int) -> None:
+    """Bar-Shalom's eq. (5.4.2-5) by dense inverses, with correlated noise, a missing axis and a random rig."""
+    rng = np.random.default_rng(seed)
+    rig = compile_rig(random_rig(rng), FACTORS, {"dvl": 1.7})
+    M = rng.normal(size=(3, 3))
+    rig["rate_cov"] = 1e-3 * M @ M.T
+    A = rng.normal(size=(15, 15))
+    belief = Belief(0, random_state(rng), 1e-3 * A @ A.T)
+    readings = np.zeros(4, READING)
+    for row, (kind, n) in zip(readings, [("dvl", 3), ("depth", 1), ("gps", 2), ("heading", 1)], strict=True):
+        row["kind"], row["sigma"] = KIND[kind], np.inf
+        row["sigma"][:n], row["z"][:3] = rng.uniform(0.01, 0.1, n), rng.normal(size=3)
+    nis, dof = normalised_innovations(as_record(belief), belief.P, rig, readings)
+    assert dof.tolist() == [3, 1, 2, 1]
+    for m in range(4):
+        r, H, C = stack(as_record(belief), rig, readings[m : m + 1])
+        assert nis[m] == pytest.approx(r @ np.linalg.inv(H @ belief.P @ H.T + C) @ r, rel=1e-9)
+
+
+def test_widths_are_quantiles_of_chi_square_and_open_where_nothing_is_said() -> None:
+    widths = gate_widths({"gps": 0.99, "heading": 0.9})
+    assert widths[KIND["gps"], 2] == pytest.approx(chi2.ppf(0.99, 2))
+    assert widths[KIND["attitude"], 3] == pytest.approx(chi2.ppf(0.9, 3))
+    assert np.isinf(widths[KIND["dvl"]]).all()
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_of_honest_readings_a_gate_leaves_out_its_share(name: str) -> None:
+    """Innovations of a consistent filter are white: of n readings the number left out is binomial."""
+    out = n = 0
+    for seed in range(2):
+        log = simulate(Scenario(duration_s=30.0), seed)
+        result = run_log(log, create(name, gate={"heading": 0.9}))
+        out, n = out + result.counts["outliers_heading"], n + len(log.heading)
+    low, high = binom.interval(0.999, n, 0.1)
+    assert low <= out <= high
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.9])
+@pytest.mark.parametrize("name", FILTERS)
+def test_behind_a_gate_outliers_are_as_if_they_were_not_there(name: str, delay_s: float) -> None:
+    """And counted once each, though a late DVL makes a filter meet them again and again."""
+    scenario = Scenario(duration_s=30.0, dvl=DvlSpec(delay_s=delay_s))
+    dirty, sparse, n = with_gps_outliers(simulate(scenario, seed=2), every=3, by_m=60.0)
+    gated = run_log(dirty, create(name, gate={"gps": 0.99999}))
+    without = run_log(sparse, create(name))
+    ungated = run_log(dirty, create(name))
+    assert gated.counts["outliers_gps"] == n > 3
+    assert np.abs(gated.online.p_WB_W - without.online.p_WB_W).max() < 1e-6
+    assert ate(dirty.truth, ungated.online).rmse_m > 5 * ate(dirty.truth, gated.online).rmse_m
+
+
+@pytest.mark.parametrize(
+    ("gate", "message"), [({"gsp": 0.99}, "gps"), ({"gps": 1.0}, "less than 1"), ({"gps": 0}, "0")]
+)
+def test_a_gate_that_cannot_be_is_an_error(gate: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        create("eskf", gate=gate)
