@@ -106,6 +106,7 @@ class DvlSpec:
     beam_sigma_mps: Positive = 0.005
     beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
     delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -115,6 +116,7 @@ class DepthSpec:
     rate_hz: Positive = 10.0
     sigma_m: Positive = 0.02
     delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -125,6 +127,7 @@ class GpsSpec:
     horizontal_sigma_m: Positive = 1.5
     vertical_sigma_m: Positive = 3.0
     delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -135,6 +138,10 @@ class HeadingSpec:
     sigma_deg: Positive = 1.0
     bias_deg: Finite = 0.0
     delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
+
+
+SensorSpec = DvlSpec | DepthSpec | GpsSpec | HeadingSpec
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -151,7 +158,8 @@ class Scenario:
     """A mission, a vehicle and its sensors.
 
     The vehicle starts afloat, surfaces every `surface_every_s` or so, and ends afloat. Depths count from where it
-    floats, down positive; courses from east, counter-clockwise. A sensor that is None is not aboard.
+    floats, down positive; courses from east, counter-clockwise. A sensor that is None is not aboard. A reading comes
+    `delay_s` after it was true, and at random up to `disorder_s` later still, so that readings overtake one another.
     """
 
     mission: str = "lawnmower"

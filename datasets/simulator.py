@@ -7,12 +7,13 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import DatasetError
 from .log import DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log, ReadingStream
 from .mission import Motion, fly
 from .rig import ImuNoise, Mounting, Rig
-from .scenario import DEGREE, DepthSpec, DvlSpec, GpsSpec, HeadingSpec, Scenario
+from .scenario import DEGREE, DepthSpec, DvlSpec, GpsSpec, HeadingSpec, Scenario, SensorSpec
 from .state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, TimeArray
 from .trajectory import Trajectory
 
@@ -27,6 +28,10 @@ RANDOM_STREAMS = {
     "gps": 5,
     "heading": 6,
     "prior": 7,
+    "dvl_disorder": 8,
+    "depth_disorder": 9,
+    "gps_disorder": 10,
+    "heading_disorder": 11,
 }
 """Every cause of randomness has a stream of its own, so that dropping one changes no other. Never renumber."""
 
@@ -65,6 +70,7 @@ def simulate(scenario: Scenario, seed: int) -> Log:
         notes=(
             f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu_rate_hz:g} Hz, "
             f"seed {seed}, noise scaled by {scenario.noise_scale:g}; the Earth does not turn.",
+            *_late(scenario),
         ),
     )
 
@@ -169,7 +175,23 @@ def _stream(kind: type[Kind], scenario: Scenario, seed: int, motion: Motion) -> 
     t_ns, z = scenario.start_ns + t_ns[heard], (z + scenario.noise_scale * error)[heard]
     if kind is HeadingStream:
         z = np.arctan2(np.sin(z), np.cos(z))
-    return kind(t_ns, t_ns + round(spec.delay_s * 1e9), z, np.tile(sigma, (len(z), 1)))
+    return kind(t_ns, t_ns + _delays(spec, kind.name, heard, seed), z, np.tile(sigma, (len(z), 1)))
+
+
+def _delays(spec: SensorSpec, sensor: str, heard: NDArray[np.bool_], seed: int) -> TimeArray:
+    """Return how long each reading that is heard is on its way, ns: delay_s, and uniformly up to disorder_s more."""
+    more_s = spec.disorder_s * random_stream(seed, f"{sensor}_disorder").random(len(heard))
+    return np.rint((spec.delay_s + more_s[heard]) * 1e9).astype(np.int64)
+
+
+def _late(scenario: Scenario) -> list[str]:
+    """Return a sentence on each sensor whose readings come late."""
+    specs = {sensor: getattr(scenario, sensor) for sensor in ("dvl", "depth", "gps", "heading")}
+    return [
+        f"{sensor} comes {spec.delay_s:g} s late, and up to {spec.disorder_s:g} s more, at random."
+        for sensor, spec in specs.items()
+        if spec is not None and (spec.delay_s or spec.disorder_s)
+    ]
 
 
 def janus_beams(beam_angle_rad: float) -> Array:

@@ -28,7 +28,7 @@ from fathom.datasets.simulator import (
 )
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, kstest, uniform
 
 SENSORS = ("dvl", "depth", "gps", "heading")
 
@@ -216,6 +216,22 @@ def test_delay_moves_reception_and_nothing_else():
     assert (late.gps.received_ns - late.gps.t_ns == 1_200_000_000).all()
     assert (prompt.dvl.received_ns == prompt.dvl.t_ns).all()
     assert np.array_equal(late.dvl.z, prompt.dvl.z)
+    assert list(late.notes[1:]) == [
+        "dvl comes 0.35 s late, and up to 0 s more, at random.",
+        "gps comes 1.2 s late, and up to 0 s more, at random.",
+    ]
+
+
+def test_disorder_lets_readings_overtake_one_another_and_moves_nothing_else():
+    scenario = Scenario(duration_s=60, heading=HeadingSpec(delay_s=0.5, disorder_s=2.0))
+    mixed, prompt = simulate(scenario, 1), simulate(Scenario(duration_s=60), 1)
+    way_s = (mixed.heading.received_ns - mixed.heading.t_ns) * 1e-9
+    assert 0.5 <= way_s.min() < 0.6
+    assert 2.4 < way_s.max() <= 2.5
+    assert kstest(way_s, uniform(0.5, 2.0).cdf).pvalue > 1e-3
+    assert (np.diff(mixed.heading.received_ns) < 0).mean() > 0.3
+    assert np.array_equal(mixed.heading.z, prompt.heading.z)
+    assert np.array_equal(mixed.dvl.received_ns, prompt.dvl.received_ns)
 
 
 # -- noise and biases
