@@ -78,7 +78,7 @@ def run(
     ] = None,
     repair: Repair = False,
 ) -> None:
-    """Run every estimator of EXPERIMENT on every one of its logs, and print the table."""
+    """Run every estimator of EXPERIMENT on every one of its logs, and print the tables."""
     with refusing_bad_input():
         from .experiment import Experiment
         from .runner import run_experiment
@@ -99,20 +99,21 @@ def run(
 
 
 def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
-    """Write table.csv and the figures of all that was ever run of this plan, and print the table of these rows."""
+    """Write the CSV files and the figures of all that was ever run of this plan, and print the tables of these rows."""
     from .experiment import ExperimentError
     from .figures import draw_figures
     from .runner import rows_of
     from .store import load_runs
-    from .table import print_table, write_table
+    from .table import print_table, write_consistency, write_table
 
     every = rows_of(load_runs(folder), plan.runs())
     try:
         write_table(every, folder / "table.csv")
+        write_consistency(every, folder / "consistency.csv")
         figures = draw_figures(every, folder)
     except OSError as error:
         raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
-    _say(f"{folder}: runs.sqlite, table.csv, {len(figures)} figures")
+    _say(f"{folder}: runs.sqlite, table.csv, consistency.csv, {len(figures)} figures")
     print_table(rows)
     for log, cause in rows.attrs["kept"].items():
         _say(f"{log}: {cause}; its rows are from an earlier run")
@@ -154,9 +155,9 @@ def _experiments() -> dict[str, str]:
 
 
 def _scores() -> dict[str, str]:
-    from .run import COSTS, SCORES
+    from .run import COSTS, INNOVATIONS, SCORES
 
-    return SCORES | COSTS
+    return SCORES | INNOVATIONS | COSTS
 
 
 _LISTS = {

@@ -1,4 +1,4 @@
-"""Figures of an experiment: the tracks, the errors over time, and accuracy against cost; PDF and PNG."""
+"""Figures of an experiment: tracks, errors and their honesty over time, accuracy against cost; PDF and PNG."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from ..datasets.state import Array
 from ..datasets.trajectory import Trajectory
-from .metrics import Alignment, ScoreError, align, associate
-from .table import Record, groups, records, summarise
+from .consistency import FALSE_ALARM, anees_of
+from .metrics import BLOCKS, Alignment, ScoreError, align, associate
+from .summary import Record, groups, is_judged, records, summarise
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#B8A000")
 """Okabe & Ito's colours, which readers with any colour vision tell apart; black is the truth's."""
@@ -58,19 +59,22 @@ def draw_figures(rows: pd.DataFrame, folder: Path) -> list[Path]:
         rows: of the store; each simulated log is drawn with the first of its seeds.
         folder: the experiment's, with its trajectories.
     """
-    every = records(rows)
+    every, summary = records(rows), summarise(rows)
     looks = looks_of([label for (label,) in groups(every, "label")])
+    judged = {log for (log,), of_log in groups(summary, "log").items() if is_judged(of_log)}
     files = []
     for (log,), of_log in groups(every, "log").items():
+        stem = folder / "figures" / re.sub(r"[^\w.=+-]+", "_", log)
+        if log in judged and any(row["nees_at"] for row in of_log):
+            files += save(draw_anees(of_log, looks, log), Path(f"{stem}-anees"))
         tracks, seed = tracks_of(of_log, folder / "trajectories")
         if not tracks:
             continue
         title = log if seed is None else f"{log}, seed {seed}"
-        stem = folder / "figures" / re.sub(r"[^\w.=+-]+", "_", log)
         files += save(draw_tracks(tracks, looks, title), Path(f"{stem}-tracks"))
         if any(track.truth is not None for track in tracks):
             files += save(draw_errors(tracks, looks, title), Path(f"{stem}-errors"))
-    priced = [row for row in summarise(rows) if row["ate_rmse_m"] is not None and row["real_time_factor"] is not None]
+    priced = [row for row in summary if row["ate_rmse_m"] is not None and row["real_time_factor"] is not None]
     if priced:
         files += save(draw_costs(priced, looks), folder / "figures" / "accuracy-cost")
     return files
@@ -186,6 +190,45 @@ def _draw_error(axes: Axes, track: Track, axis: int, colour: str) -> None:
     else:
         axes.plot(t_s, _error(track)[:, axis], color="black", linewidth=0.8, linestyle=":")
     axes.axhline(0, color="black", linewidth=0.4)
+
+
+def draw_anees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Figure:
+    """Draw the NEES of each block, averaged over the seeds, at the fixed times of one log, with the band of honesty.
+
+    The band is that of the most seeds that any estimator has; hindsight is open and dotted.
+    """
+    figure, panels = _figure(len(BLOCKS), 1, WIDTH_IN, 1.2 + 1.5 * len(BLOCKS))
+    done = [row for row in rows if row["status"] == "done"]
+    lines = {key: anees_of([row["nees_at"] for row in of]) for key, of in groups(done, "label", "output").items()}
+    for block, axes in zip(BLOCKS, panels, strict=True):
+        averages = {key: of_line[block] for key, of_line in lines.items() if block in of_line}
+        for (label, output), average in averages.items():
+            online, look = output == "online", looks[label]
+            style = {"marker": look.marker, "markersize": 4, "markerfacecolor": look.colour if online else "white"}
+            axes.plot(
+                average.t_s,
+                average.value,
+                color=look.colour,
+                linestyle=look.dash if online else ":",
+                linewidth=0.8,
+                **style,
+            )
+        if averages:
+            widest = max(averages.values(), key=lambda average: (average.runs.max(), len(average)))
+            axes.axhspan(widest.low.min(), widest.high.max(), color="black", alpha=0.12, linewidth=0)
+        axes.axhline(1, color="black", linewidth=0.4)
+        axes.set_yscale("log")
+        axes.set_ylabel(block)
+    panels[-1].set_xlabel("time, s")
+    runs = max((int(average.runs.max()) for of_line in lines.values() for average in of_line.values()), default=0)
+    figure.suptitle(f"{title}: NEES by degree of freedom, mean of {runs} seeds", fontsize=10)
+    handles = [_handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(done, "label")]
+    if any(output == "hindsight" for _, output in lines):
+        handles.append(_handle("with hindsight", "o", "black", False))
+    band = f"honest, but for {FALSE_ALARM:.1%} of figures"
+    handles.append(Line2D([], [], color="black", alpha=0.12, linewidth=6, label=band))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    return figure
 
 
 def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:

@@ -5,10 +5,11 @@ from .alignment import Alignment, align
 from .association import ScoreError, associate
 from .pose_error import Dims, pooled_rmse
 from .relative_error import Pairs, Rpe, SegmentError, Unit, check_step, rpe, segment_errors
-from .state_error import BLOCKS, Block, StateErrors, error_state, nees, state_errors
+from .state_error import BLOCKS, DOF, Block, StateErrors, coverage, error_state, nees, not_positive, state_errors
 
 __all__ = [
     "BLOCKS",
+    "DOF",
     "Alignment",
     "Ate",
     "Block",
@@ -26,10 +27,12 @@ __all__ = [
     "associate",
     "ate",
     "check_step",
+    "coverage",
     "drift",
     "error_state",
     "horizontal_error",
     "nees",
+    "not_positive",
     "outage_drift",
     "pooled_rmse",
     "rpe",

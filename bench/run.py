@@ -8,18 +8,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from time import perf_counter_ns
-from typing import Annotated, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from ..datasets.epochs import Voyage, cut
+from ..datasets.epochs import SENSOR, Epoch, Voyage, cut
 from ..datasets.log import AttitudeStream, HeadingStream, Log
+from ..datasets.rig import Rig
 from ..datasets.state import Belief, TimeArray
 from ..datasets.trajectory import Trajectory
+from ..estimators.imu import compile_rig
+from ..estimators.innovation import INNOVATION, innovations
 from ..estimators.interface import Diverged, Estimator, Pass
 from .metrics import (
+    BLOCKS,
     Alignment,
     Dims,
     Pairs,
@@ -29,9 +34,11 @@ from .metrics import (
     associate,
     ate,
     check_step,
+    coverage,
     drift,
     horizontal_error,
     nees,
+    not_positive,
     outage_drift,
     rpe,
     segment_errors,
@@ -43,6 +50,9 @@ Positive: TypeAlias = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 LOST_M = 1e7
 """Nothing on Earth is this far from W's origin, m: an estimate that says so has diverged."""
+
+ON_TIME_NS = 1_000_000
+"""A reading at most this much older than its epoch is true at it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +72,7 @@ class Result:
         duration_s: how much of the log was driven through.
         imu_samples: how many IMU samples went in.
         notes: how the start was found, where the log states no prior.
+        nis: INNOVATION rows, in the order of reception; None where they were not asked for.
     """
 
     status: Status
@@ -76,6 +87,7 @@ class Result:
     duration_s: float
     imu_samples: int
     notes: tuple[str, ...] = ()
+    nis: NDArray[Any] | None = None
 
     @property
     def outputs(self) -> dict[str, Trajectory]:
@@ -111,8 +123,7 @@ class Tape:
             Diverged: it is not finite, is off this planet, or has no covariance although the first one had.
             ValueError: it is for another time than the t_ns it was asked for.
         """
-        if belief.t_ns != t_ns:
-            raise ValueError(f"asked for a belief at {t_ns} ns, was given one at {belief.t_ns} ns")
+        _check_time(belief, t_ns)
         k, state = len(self.belief_ns), belief.state
         self.t_ns[k], self.R_WB[k], self.P[k] = t_ns, state.R_WB, belief.P
         row = self.vectors[k]
@@ -135,6 +146,56 @@ class Tape:
         return Trajectory(self.t_ns[:n], self.R_WB[:n], p, v, b_a, b_g, self.P[:n] if self.has_P else None)
 
 
+class Examiner:
+    """Judges an estimator by readings that it has not seen yet: the NIS of each, against the belief from before it.
+
+    It asks for the belief between the two halves of an epoch, its motion and its readings. Readings that come late are
+    left out, for they speak of an earlier state; so are those of an estimator that keeps no covariance.
+
+    Attributes:
+        counts: readings left out because they came late ("nis_late"), or because the belief has S no covariance
+            ("nis_undefined").
+    """
+
+    def __init__(self, estimator: Estimator, rig: Rig) -> None:
+        self.counts = {"nis_late": 0, "nis_undefined": 0}
+        self._rig = compile_rig(rig, estimator.factors, getattr(estimator, "inflate", {}))
+        self._tables: list[NDArray[Any]] = []
+
+    def wants(self, epoch: Epoch) -> bool:
+        """Return whether any reading of the epoch is on time."""
+        on_time = self._on_time(epoch)
+        self.counts["nis_late"] += len(epoch.readings) - int(on_time.sum())
+        return bool(on_time.any())
+
+    def judge(self, belief: Belief, epoch: Epoch) -> None:
+        """Take the innovations of the epoch's readings, given the belief at its time that has not seen them.
+
+        Raises:
+            ValueError: the belief is for another time.
+        """
+        _check_time(belief, epoch.t_ns)
+        if np.isnan(belief.P).all():
+            return
+        table = innovations(belief, epoch.readings[self._on_time(epoch)], self._rig)
+        defined = np.isfinite(table["nis"])
+        self.counts["nis_undefined"] += int((~defined).sum())
+        self._tables.append(table[defined])
+
+    def table(self) -> NDArray[Any]:
+        """Return all that was taken, as INNOVATION rows."""
+        return np.concatenate([np.zeros(0, INNOVATION), *self._tables])
+
+    @staticmethod
+    def _on_time(epoch: Epoch) -> NDArray[np.bool_]:
+        return epoch.t_ns - epoch.readings["t_ns"] <= ON_TIME_NS
+
+
+def _check_time(belief: Belief, t_ns: int) -> None:
+    if belief.t_ns != t_ns:
+        raise ValueError(f"asked for a belief at {t_ns} ns, was given one at {belief.t_ns} ns")
+
+
 def run_log(
     log: Log,
     estimator: Estimator,
@@ -142,6 +203,7 @@ def run_log(
     score_period_s: float = 1.0,
     max_gap_s: float = 1.0,
     timeout_s: float | None = None,
+    nis: bool = False,
 ) -> Result:
     """Drive an estimator through a log, in the order of reception.
 
@@ -153,6 +215,9 @@ def run_log(
         score_period_s: beliefs are asked for this far apart: at the truth's own stamps, else on a regular grid.
         max_gap_s: longest gap in the IMU that is bridged.
         timeout_s: longest time for the whole run, looked at after each step; None for no limit.
+        nis: judge the estimator by its innovations. It then gets each epoch in two halves, first the motion without
+            readings, then the readings without motion, and is asked for its belief in between. A step's time is that of
+            both halves; the belief is not charged, but what it leaves computed may make a smoother's next step cheaper.
 
     Raises:
         DatasetError: no prior can be made for the log.
@@ -162,6 +227,7 @@ def run_log(
     readings = sum(len(stream) for sensor, stream in log.streams.items() if sensor in estimator.factors)
     limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
     smoothed, finish_ns, counts = None, 0, {}
+    examiner = Examiner(estimator, log.rig) if nis else None
     with _collector_off():
         voyage = cut(log, score_ticks(log, score_period_s), estimator.factors, max_gap_s)
         tape = Tape(sum(epoch.tick for epoch in voyage.epochs))
@@ -172,7 +238,7 @@ def run_log(
         except Exception as error:
             ending = Ending("failed", _describe(error), voyage.start_ns)
         else:
-            ending = _drive(run, voyage, tape, limit_ns)
+            ending = _drive(run, voyage, tape, limit_ns, examiner)
             smoothed, finish_ns, ending = _finish(run, voyage, ending)
             counts = dict(run.counts)
 
@@ -186,10 +252,11 @@ def run_log(
         np.array(tape.step_ns, np.int64),
         np.array(tape.belief_ns, np.int64),
         finish_ns,
-        {"readings": readings} | voyage.counts | counts,
+        {"readings": readings} | voyage.counts | (examiner.counts if examiner else {}) | counts,
         (driven[-1].t_ns - voyage.start_ns) * 1e-9 if driven else 0.0,
         sum(len(epoch.imu) for epoch in driven),
         notes,
+        examiner.table() if examiner else None,
     )
 
 
@@ -203,17 +270,23 @@ def _with_prior(log: Log) -> tuple[Log, tuple[str, ...]]:
     return log.with_prior(start.belief), start.notes
 
 
-def _drive(run: Pass, voyage: Voyage, tape: Tape, limit_ns: float) -> Ending:
-    """Hand over every epoch; time `step` and `belief` apart, and collect garbage outside both."""
+def _drive(run: Pass, voyage: Voyage, tape: Tape, limit_ns: float, examiner: Examiner | None) -> Ending:
+    """Hand over every epoch, in halves for an examiner; time `step` and `belief` apart, and collect garbage outside."""
     clock, step, step_ns = perf_counter_ns, run.step, tape.step_ns.append
     t_ns = voyage.start_ns
     try:
         for epoch in voyage.epochs:
-            t_ns = epoch.t_ns
+            t_ns, spent_ns = epoch.t_ns, 0
+            if examiner is not None and examiner.wants(epoch):
+                started = clock()
+                step(epoch._replace(readings=epoch.readings[:0], tick=False))
+                spent_ns = clock() - started
+                examiner.judge(run.belief(), epoch)
+                epoch = epoch._replace(imu=epoch.imu[:0])
             started = clock()
             step(epoch)
             ended = clock()
-            step_ns(ended - started)
+            step_ns(spent_ns + ended - started)
             if ended > limit_ns:
                 return Ending("failed", "out of time", t_ns)
             if epoch.tick:
@@ -306,8 +379,24 @@ SCORES = {
     "outage_percent": "worst growth of the horizontal error in a GPS outage, % of the distance travelled in it",
     "cep50_m": "median horizontal error, m",
     "drms_m": "root mean square of the horizontal error, m",
-    "anees_position": "mean NEES of position over the ticks; 3 when the covariance is honest",
+    "nees_position": "mean NEES of position over the ticks; 3 when the covariance is honest",
+    "nees_attitude": "mean NEES of attitude; 3 when honest",
+    "nees_velocity": "mean NEES of velocity; 3 when honest",
+    "nees_biases": "mean NEES of both biases; 6 when honest",
+    "nees_all": "mean NEES of the whole state; 15 when honest",
+    "within_1sigma_position": "share of the components of position that err by at most 1 σ; 0.683 when honest",
+    "within_2sigma_position": "the same within 2 σ; 0.954 when honest",
+    "within_3sigma_position": "the same within 3 σ; 0.997 when honest",
+    "within_1sigma_all": "share of all 15 components that err by at most 1 σ; 0.683 when honest",
+    "within_2sigma_all": "the same within 2 σ; 0.954 when honest",
+    "within_3sigma_all": "the same within 3 σ; 0.997 when honest",
+    "n_not_positive": "poses whose covariance is not positive definite; their NEES is then absent",
 }
+INNOVATIONS = {
+    f"nis_{sensor}": f"NIS of the {sensor} readings that came in time, by degree of freedom: mean; 1 when honest"
+    for sensor in dict.fromkeys(SENSOR)
+}
+"""Only where `nis` is asked for, and of what was said online."""
 COSTS = {
     "step_median_us": "time of one step: median, µs",
     "step_p99_us": "time of one step: 99th percentile, µs",
@@ -331,6 +420,8 @@ class Scoring:
         rpe_delta, rpe_unit, rpe_pairs: see `fathom.bench.metrics.rpe`.
         segment_lengths_m: of the sub-trajectories.
         score_period_s: beliefs are asked for this far apart; 1 ms or more.
+        nees_epochs: at how many times, evenly spaced over the log, NEES is averaged over the seeds (see `consistency`).
+        nis: judge the estimators by their innovations, see `run_log`; their costs are then not to be compared.
     """
 
     align: Alignment = "none"
@@ -340,6 +431,8 @@ class Scoring:
     rpe_pairs: Pairs = "all"
     segment_lengths_m: tuple[Positive, ...] = (50.0, 100.0, 200.0, 400.0)
     score_period_s: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
+    nees_epochs: Annotated[int, Field(ge=1, le=1000)] = 10
+    nis: bool = False
 
     @model_validator(mode="after")
     def _step_is_possible(self) -> Scoring:
@@ -350,7 +443,7 @@ class Scoring:
 def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict[str, float | None]:  # noqa: B008
     """Return every score of SCORES by name; None where it is not defined for this log and estimate.
 
-    NEES is of the estimate itself, so only where nothing is aligned and the truth is one.
+    Covariances are judged only where `can_judge` says so.
     """
     row: dict[str, float | None] = dict.fromkeys(SCORES)
     if log.truth is None:
@@ -364,9 +457,30 @@ def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict
     for part in (_absolute, _state, _relative, _segments, _drift, _outages, _horizontal):
         with suppress(ScoreError):
             row |= part(log, truth, aligned, scoring)
-    if scoring.align == "none" and log.truth_kind == "truth":
+    if can_judge(log, scoring):
+        row |= _honesty(truth, estimate)
+    return row
+
+
+def can_judge(log: Log, scoring: Scoring) -> bool:
+    """Return whether covariances can be judged: where nothing is aligned, and the truth is one."""
+    return log.truth is not None and log.truth_kind == "truth" and scoring.align == "none"
+
+
+def _honesty(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
+    """Return NEES and coverage; what cannot be had of one block (an unknown truth, a P that is none) is absent."""
+    row: dict[str, float | None] = {}
+    for block in BLOCKS:
         with suppress(ScoreError):
-            row["anees_position"] = float(np.nanmean(nees(truth, estimate, "position")))
+            each = nees(truth, estimate, block)
+            if not np.isnan(each).all():
+                row[f"nees_{block}"] = float(np.nanmean(each))
+    for block in ("position", "all"):
+        with suppress(ScoreError):
+            shares = coverage(truth, estimate, block)
+            row |= {f"within_{k}sigma_{block}": share for k, share in enumerate(shares, 1)}
+    with suppress(ScoreError):
+        row["n_not_positive"] = len(not_positive(estimate))
     return row
 
 
@@ -416,6 +530,25 @@ def _outages(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring
 def _horizontal(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
     e = horizontal_error(truth, estimate)
     return {"cep50_m": e.cep50_m, "drms_m": e.drms_m}
+
+
+def innovation_scores(result: Result) -> dict[str, float | None]:
+    """Return every score of INNOVATIONS by name; None where it was not asked for, or no such reading came in time."""
+    row: dict[str, float | None] = dict.fromkeys(INNOVATIONS)
+    for sensor, dof in innovation_dof(result).items():
+        row[f"nis_{sensor}"] = float(_of_sensor(result, sensor)["nis"].sum()) / dof
+    return row
+
+
+def innovation_dof(result: Result) -> dict[str, int]:
+    """Return over how many degrees of freedom the NIS of each sensor is; only those that have any."""
+    every = {sensor: int(_of_sensor(result, sensor)["dof"].sum()) for sensor in dict.fromkeys(SENSOR)}
+    return {sensor: dof for sensor, dof in every.items() if dof > 0}
+
+
+def _of_sensor(result: Result, sensor: str) -> NDArray[Any]:
+    nis = np.zeros(0, INNOVATION) if result.nis is None else result.nis
+    return nis[np.isin(nis["kind"], [kind for kind, name in enumerate(SENSOR) if name == sensor])]
 
 
 def costs(result: Result) -> dict[str, float | None]:

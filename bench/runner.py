@@ -28,8 +28,9 @@ from ..datasets.log import Log
 from ..datasets.opening import RecordingNotFound
 from ..datasets.trajectory import Trajectory
 from ..estimators.interface import Estimator
+from .consistency import nees_at
 from .experiment import Experiment, ExperimentError, Run, plain
-from .run import Result, costs, run_log, scores, warm_up
+from .run import Result, can_judge, costs, innovation_dof, innovation_scores, run_log, scores, warm_up
 from .store import Row, Store, provenance
 
 THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")
@@ -124,8 +125,9 @@ def _make_room(folder: Path) -> None:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ExperimentError(f"{path}: cannot be made ({error.strerror}); give another --out") from None
-    if (folder / "table.csv").is_dir():
-        raise ExperimentError(f"{folder / 'table.csv'}: a folder is in the way; move it, or give another --out")
+    for path in (folder / "table.csv", folder / "consistency.csv"):
+        if path.is_dir():
+            raise ExperimentError(f"{path}: a folder is in the way; move it, or give another --out")
 
 
 def _select(experiment: Experiment, only: str | None) -> list[Run]:
@@ -343,6 +345,7 @@ class Bench:
                     score_period_s=scoring.score_period_s,
                     max_gap_s=experiment.max_gap_s,
                     timeout_s=experiment.timeout_s,
+                    nis=scoring.nis,
                 )
             return self.rows(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
         except Exception as error:
@@ -385,6 +388,10 @@ class Bench:
         for output, trajectory in result.outputs.items():
             name = save(task, output, trajectory)
             row = task.row(result.status, result.cause, output) | shared | scores(log, trajectory, scoring)
+            if output == "online":
+                row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
+            if can_judge(log, scoring):
+                row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
             rows.append(row | {"lookahead_s": trajectory.lookahead_s, "trajectory": name})
         return rows or [task.row(result.status, result.cause) | shared]
 

@@ -1,4 +1,4 @@
-"""Errors of the whole state: heading to biases, and whether the estimate's covariance owns up to them (NEES)."""
+"""Errors of the whole state, heading to biases, and whether the covariance owns up to them: NEES and coverage."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from ..datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array
+from ..datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, TimeArray
 from ..datasets.trajectory import Trajectory
 from .association import ScoreError, associate
 from .pose_error import check_finite, heading_roll_pitch, rmse, rotation_vector, wrapped
@@ -20,6 +20,7 @@ BLOCKS: dict[Block, slice] = {
     "biases": slice(ACCEL_BIAS.start, GYRO_BIAS.stop),
     "all": slice(0, DIM),
 }
+DOF: dict[Block, int] = {block: of.stop - of.start for block, of in BLOCKS.items()}
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,73 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
 
     Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2; e in the coordinates of `fathom.datasets.state`.
     """
+    e, P, t_ns = _judged(truth, estimate, block, tolerance_ns)
+    known = ~(np.isnan(e).any(axis=1) | np.isnan(P).any(axis=(1, 2)))
+    score = np.full(len(e), np.nan)
+    try:
+        L = np.linalg.cholesky(P[known])
+    except np.linalg.LinAlgError:
+        row = int(np.flatnonzero(known)[np.argmin(np.linalg.eigvalsh(P[known])[:, 0])])
+        raise ScoreError(f"nees: P of {block!r} is not positive definite at {t_ns[row]} ns") from None
+    whitened = np.linalg.solve(L, e[known][:, :, None])[:, :, 0]  # L w = e, so eᵀ P⁻¹ e = wᵀ w
+    score[known] = (whitened * whitened).sum(axis=1)
+    return score
+
+
+def coverage(
+    truth: Trajectory, estimate: Trajectory, block: Block = "position", tolerance_ns: int = 0
+) -> tuple[float, float, float]:
+    """Return the share of the errors' components that lie within 1, 2 and 3 of their own σ, the roots of P's diagonal.
+
+    Of an honest Gaussian estimate 0.6827, 0.9545 and 0.9973 on average, whatever the correlations. Rows and components
+    where P or the truth is NaN are left out.
+
+    Args:
+        truth, estimate, block, tolerance_ns: as for `nees`.
+
+    Raises:
+        ScoreError: as `nees`, but for a P that is not positive definite; or P is NaN in every row.
+    """
+    e, P, _ = _judged(truth, estimate, block, tolerance_ns)
+    variance = np.einsum("nii->ni", P)
+    known = ~(np.isnan(e) | np.isnan(variance))
+    if not known.any():
+        raise ScoreError("coverage: no row has a covariance")
+    squared, bound = e[known] ** 2, variance[known]
+    one, two, three = (float((squared <= k**2 * bound).mean()) for k in (1, 2, 3))
+    return one, two, three
+
+
+def not_positive(estimate: Trajectory) -> TimeArray:
+    """Return the rows whose P is not positive definite, (k,); rows of NaN do not count.
+
+    Raises:
+        ScoreError: the estimate has no P.
+    """
+    if estimate.P is None:
+        raise ScoreError("the estimate has no covariances; ask the estimator for them")
+    rows = np.flatnonzero(~np.isnan(estimate.P).any(axis=(1, 2)))
+    try:
+        np.linalg.cholesky(estimate.P[rows])
+    except np.linalg.LinAlgError:
+        return np.array([row for row in rows if not _has_root(estimate.P[row])], np.int64)
+    return np.zeros(0, np.int64)
+
+
+def _has_root(P: Array) -> bool:
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns: int) -> tuple[Array, Array, TimeArray]:
+    """Return the block's errors (n, k), covariances (n, k, k) and times (n,), of the associated rows.
+
+    Raises:
+        ScoreError: no such block, the estimate has no P, or part of the block is unknown in every row.
+    """
     if block not in BLOCKS:
         raise ScoreError(f"nees: no block {block!r}; there are {', '.join(BLOCKS)}")
     truth, estimate = associate(truth, estimate, tolerance_ns)
@@ -83,22 +151,13 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
         raise ScoreError("nees: the estimate has no covariances; ask the estimator for them")
     check_finite(estimate)
     of = BLOCKS[block]
-    e, P = error_state(truth, estimate)[:, of], estimate.P[:, of, of]
+    e = error_state(truth, estimate)[:, of]
     unknown = np.isnan(e).all(axis=0)
     if unknown.any():
         raise ScoreError(
             f"nees: {np.count_nonzero(unknown)} of the {unknown.size} components of {block!r} have no known error"
         )
-    known = ~(np.isnan(e).any(axis=1) | np.isnan(P).any(axis=(1, 2)))
-    score = np.full(len(e), np.nan)
-    try:
-        L = np.linalg.cholesky(P[known])
-    except np.linalg.LinAlgError:
-        row = int(np.flatnonzero(known)[np.argmin(np.linalg.eigvalsh(P[known])[:, 0])])
-        raise ScoreError(f"nees: P of {block!r} is not positive definite at {estimate.t_ns[row]} ns") from None
-    whitened = np.linalg.solve(L, e[known][:, :, None])[:, :, 0]  # L w = e, so eᵀ P⁻¹ e = wᵀ w
-    score[known] = (whitened * whitened).sum(axis=1)
-    return score
+    return e, estimate.P[:, of, of], estimate.t_ns
 
 
 def error_state(truth: Trajectory, estimate: Trajectory) -> Array:

@@ -17,7 +17,7 @@ from typing import Any
 import pandas as pd
 
 from .experiment import ExperimentError
-from .run import COSTS, SCORES
+from .run import COSTS, INNOVATIONS, SCORES
 
 Row = Mapping[str, Any]
 
@@ -34,6 +34,10 @@ OUTCOME = {
     "dims": "TEXT",
     "duration_s": "REAL",
 }
+HONESTY = {
+    "nees_at": "TEXT",  # JSON: NEES by block at times fixed beforehand, see `consistency.nees_at`
+    "nis_dof": "TEXT",  # JSON: degrees of freedom of each sensor's NIS
+}
 ORIGIN = {
     "estimator": "TEXT",
     "spec": "TEXT",  # JSON
@@ -47,7 +51,9 @@ ORIGIN = {
     "versions": "TEXT",  # JSON
     "machine": "TEXT",  # JSON
 }
-COLUMNS = IDENTITY | OUTCOME | dict.fromkeys([*SCORES, *COSTS], "REAL") | ORIGIN
+COLUMNS = IDENTITY | OUTCOME | dict.fromkeys([*SCORES, *INNOVATIONS, *COSTS], "REAL") | HONESTY | ORIGIN
+RENAMED = {"anees_position": "nees_position"}
+"""Columns that an older version called otherwise."""
 SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"
 
 
@@ -79,7 +85,11 @@ class Store:
         run("PRAGMA synchronous = FULL")
         with self.connection:
             run(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())})")
-            there = {row[1] for row in run("PRAGMA table_info(runs)")}
+            there = _columns(self.connection)
+            for old, new in RENAMED.items():
+                if old in there and new not in there:
+                    run(f"ALTER TABLE runs RENAME COLUMN {old} TO {new}")
+                    there.add(new)
             for name in COLUMNS.keys() - there:
                 run(f"ALTER TABLE runs ADD COLUMN {name} {COLUMNS[name]}")
             run("CREATE UNIQUE INDEX IF NOT EXISTS one_row ON runs (experiment, log, label, ifnull(seed, -1), output)")
@@ -125,10 +135,16 @@ class Store:
         self.close()
 
 
+def _columns(connection: sqlite3.Connection) -> set[str]:
+    return {row[1] for row in connection.execute("PRAGMA table_info(runs)")}
+
+
 def read_rows(connection: sqlite3.Connection) -> pd.DataFrame:
-    """Return the rows of an open store."""
-    cursor = connection.execute(f"SELECT {', '.join(COLUMNS)} FROM runs ORDER BY rowid")
-    table = pd.DataFrame(cursor.fetchall(), columns=list(COLUMNS))
+    """Return the rows of an open store; columns that an older version did not know are empty."""
+    there = _columns(connection)
+    known = [name for name in COLUMNS if name in there]
+    cursor = connection.execute(f"SELECT {', '.join(known)} FROM runs ORDER BY rowid")
+    table = pd.DataFrame(cursor.fetchall(), columns=known).reindex(columns=list(COLUMNS))
     numbers = [name for name, kind in COLUMNS.items() if kind == "REAL"]
     return table.astype(dict.fromkeys(numbers, "float64") | {"seed": "Int64"})
 

@@ -1,14 +1,12 @@
-"""The numbers of an experiment as people read them: seeds pooled, on the terminal and in table.csv."""
+"""The numbers of an experiment on the terminal and as CSV."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from statistics import fmean, median
 from textwrap import shorten
-from typing import Any, TypeAlias
 
 import pandas as pd
 from rich import box
@@ -16,24 +14,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from .metrics import pooled_rmse
-
-Record: TypeAlias = dict[str, Any]
-"""One row, absent values being None."""
-
-POOLED = {"ate_rmse_m": "n_scored", "heading_rmse_deg": "n_scored", "rpe_rmse_m": "n_rpe", "drms_m": "n_scored"}
-"""Root mean squares are pooled over seeds before the root, each with its own count."""
-
-MEAN = ("drift_end_percent", "drift_max_percent", "outage_percent", "segment_percent", "cep50_m", "anees_position")
-MEDIAN = ("step_median_us", "step_p99_us", "real_time_factor", "us_per_imu_sample", "peak_mb")
-SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
+from .metrics import BLOCKS
+from .run import INNOVATIONS
+from .summary import CONSISTENCY, OUTLIERS, Record, consistency, groups, is_judged, records, summarise
 
 SHOWN = {
     "ate_rmse_m": "ATE\nm",
     "heading_rmse_deg": "heading\n°",
     "drift_end_percent": "drift\n%",
     "rpe_rmse_m": "RPE\nm",
-    "anees_position": "NEES\n/3",
+    "nees_position": "NEES\n/3",
     "step_median_us": "step\nmedian",
     "step_p99_us": "\np99",
     "real_time_factor": "× real\ntime",
@@ -42,75 +32,32 @@ ABSENT = "–"
 CAUSE_WIDTH = 160
 
 
-def records(rows: pd.DataFrame) -> list[Record]:
-    """Return the rows of a table of runs as plain Python."""
-    return [
-        {str(name): None if pd.isna(value) else value for name, value in row.items()} for row in rows.to_dict("records")
-    ]
-
-
-def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Record]]:
-    """Return the rows by these keys, in order of first appearance."""
-    found: dict[tuple[Any, ...], list[Record]] = {}
-    for row in rows:
-        found.setdefault(tuple(row[key] for key in keys), []).append(row)
-    return found
-
-
-def summarise(rows: pd.DataFrame) -> list[Record]:
-    """Return one record per log, estimator and output, over the seeds that came to their end.
-
-    Squared errors are pooled before the root; percentages, CEP50 and NEES are averaged; of costs, the median is taken.
-    `runs` and `done` say over how many; where none is done, the numbers are None.
-    """
-    every = records(rows)
-    runs = {key: len(groups(of, "seed")) for key, of in groups(every, "log", "label").items()}
-    summary = []
-    for (log, label, output), group in groups(every, "log", "label", "output").items():
-        done = [row for row in group if row["status"] == "done"]
-        record: Record = {"log": log, "label": label, "output": output}
-        record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
-        record |= _rpe_step(group)
-        record |= {"runs": runs[log, label], "done": len(done)}
-        record |= {count: sum(row[count] or 0 for row in done) for count in ("n_scored", "n_rpe")}
-        record |= {name: _pooled(done, name, count) for name, count in POOLED.items()}
-        record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
-        record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
-        summary.append(record)
-    return summary
-
-
-def _rpe_step(group: Sequence[Record]) -> Record:
-    """Return which RPE a group's is, from its spec; None where that does not tell."""
-    scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
-    return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
-
-
-def _pooled(done: Sequence[Record], name: str, count: str) -> float | None:
-    known = [row for row in done if row[name] is not None]
-    return pooled_rmse([row[name] for row in known], [row[count] for row in known]) if known else None
-
-
-def _over_seeds(statistic: Callable[[list[float]], float], done: Sequence[Record], name: str) -> float | None:
-    known = [row[name] for row in done if row[name] is not None]
-    return statistic(known) if known else None
-
-
 def write_table(rows: pd.DataFrame, path: Path) -> None:
     """Write what `summarise` returns as CSV; an absent number is an empty field."""
     pd.DataFrame(summarise(rows)).to_csv(path, index=False)
 
 
+def write_consistency(rows: pd.DataFrame, path: Path) -> None:
+    """Write what `consistency` returns as CSV."""
+    pd.DataFrame(consistency(rows), columns=list(CONSISTENCY)).to_csv(path, index=False)
+
+
 def print_table(rows: pd.DataFrame, console: Console | None = None) -> None:
-    """Print one table per log, then what did not come to its end, and whose readings were mostly of no use."""
+    """Print the tables of each log, then what did not come to its end, and whose readings were mostly of no use.
+
+    Accuracy and cost for every log; honesty where NIS was asked for, or seeds are enough for ANEES; late readings and
+    outliers where there were any.
+    """
     if console is None:
         console = Console()
         if not console.is_terminal:
             console = Console(width=120)
     for summary in groups(summarise(rows), "log").values():
-        console.print(_table(summary))
-        console.print()
-    for line in failures(rows) + mostly_outside(rows):
+        for table in (_accuracy(summary), _honesty(summary), _late_or_out(summary)):
+            if table is not None:
+                console.print(table)
+                console.print()
+    for line in failures(rows) + mostly_outside(rows) + not_positive(rows):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
 
 
@@ -138,11 +85,88 @@ def mostly_outside(rows: pd.DataFrame) -> list[str]:
     return list(lines.values())
 
 
-def _table(summary: Sequence[Record]) -> Table:
+def not_positive(rows: pd.DataFrame) -> list[str]:
+    """Return a line for each estimator whose covariance is not positive definite somewhere."""
+    return [
+        f"{row['log']} / {row['label']} {row['output']}: {row['n_not_positive']} covariances are not positive definite"
+        for row in summarise(rows)
+        if row["n_not_positive"]
+    ]
+
+
+def _accuracy(summary: Sequence[Record]) -> Table:
     first = next((row for row in summary if row["truth_kind"] is not None), summary[0])
+    table = _empty(first["log"], _caption(first), ("sees\nahead", "runs\ndone", *SHOWN.values()))
+    for (label,), of_label in groups(summary, "label").items():
+        for k, row in enumerate(of_label):
+            numbers = (_cell(name, row[name]) for name in SHOWN)
+            table.add_row(Text("" if k else label), _lookahead(row), f"{row['done']}/{row['runs']}", *numbers)
+    return table
+
+
+def _honesty(summary: Sequence[Record]) -> Table | None:
+    """ANEES, NIS and coverage; None where there is not enough."""
+    if not is_judged(summary):
+        return None
+    sensors = [name for name in INNOVATIONS if any(row[name] is not None for row in summary)]
+    times = max((row["anees_times"] or 0 for row in summary), default=0)
+    caption = (
+        "squared errors over what the covariance says, by degree of freedom: 1 is honest, more is overconfident\n"
+        f"ANEES: over the runs, at {times} fixed times; ▲k, ▼k: at k of them above, below the chi-square interval\n"
+        "NIS: over all readings that came in time. Position within 1, 2, 3 σ: 68, 95, 99.7 % are due"
+    )
+    blocks = [f"ANEES\n{block}   " if block == "position" else f"\n{block}   " for block in BLOCKS]
+    nis = [("NIS\n" if k == 0 else "\n") + name.removeprefix("nis_") for k, name in enumerate(sensors)]
+    table = _empty(
+        f"{summary[0]['log']}: honesty", caption, ("sees\nahead", "runs", *blocks, *nis, "within\n1, 2, 3 σ %")
+    )
+    for (label,), of_label in groups(summary, "label").items():
+        for k, row in enumerate(of_label):
+            numbers = [_anees(row, block) for block in BLOCKS]
+            numbers += [_cell(name, row[name]) for name in sensors]
+            table.add_row(Text("" if k else label), _lookahead(row), f"{row['done']}", *numbers, _within(row))
+    return table
+
+
+def _anees(row: Record, block: str) -> str:
+    value, above, below = (row[f"anees_{block}{part}"] for part in ("", "_above", "_below"))
+    if value is None:
+        return f"{ABSENT}   "
+    mark = (f"▲{above}" if above else "") + (f"▼{below}" if below else "")
+    return f"{_three_figures(value)} {mark:<2}"
+
+
+def _within(row: Record) -> str:
+    shares = [row[f"within_{k}sigma_position"] for k in (1, 2, 3)]
+    if None in shares:
+        return ABSENT
+    return " ".join(f"{100 * share:.{digits}f}" for share, digits in zip(shares, (0, 0, 1), strict=True))
+
+
+def _late_or_out(summary: Sequence[Record]) -> Table | None:
+    """What became of late readings and outliers; None where there were none."""
+    outliers = [name for name in summary[0] if name.startswith(OUTLIERS)]
+    columns = {
+        "readings": "readings",
+        "late_used": "late,\nused",
+        "late_dropped": "late,\ndropped",
+        "carried": "carried",
+    }
+    columns |= {name: f"outliers\n{name.removeprefix(OUTLIERS)}" for name in outliers}
+    if not any(row[name] for row in summary for name in ("late_used", "late_dropped", *outliers)):
+        return None
+    caption = "over all runs; carried: tied to the keyframe before by the IMU"
+    table = _empty(f"{summary[0]['log']}: late readings and outliers", caption, columns.values())
+    for (label,), (row, *_) in groups(summary, "label").items():
+        table.add_row(Text(label), *(f"{row[name]:,}" for name in columns))
+    return table
+
+
+def _empty(title: str, caption: str, headings: Iterable[str]) -> Table:
+    """Return a table without rows, whose first column is the estimator's."""
     table = Table(
-        title=Text(first["log"], "table.title"),
-        caption=Text(_caption(first), "table.caption"),
+        title=Text(title, "table.title"),
+        caption=Text(caption, "table.caption"),
         title_justify="left",
         caption_justify="left",
         box=box.SIMPLE_HEAD,
@@ -151,14 +175,8 @@ def _table(summary: Sequence[Record]) -> Table:
         padding=(0, 1, 0, 0),
     )
     table.add_column("estimator", overflow="fold", min_width=14)
-    table.add_column("sees\nahead", justify="right", no_wrap=True)
-    table.add_column("runs\ndone", justify="right", no_wrap=True)
-    for heading in SHOWN.values():
+    for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
-    for (label,), of_label in groups(summary, "label").items():
-        for k, row in enumerate(of_label):
-            numbers = (_cell(name, row[name]) for name in SHOWN)
-            table.add_row(Text("" if k else label), _lookahead(row), f"{row['done']}/{row['runs']}", *numbers)
     return table
 
 
@@ -181,7 +199,7 @@ def _lookahead(row: Record) -> str:
 def _cell(name: str, value: float | None) -> str:
     if value is None:
         return ABSENT
-    if name == "anees_position":
+    if name == "nees_position":
         return _three_figures(value / 3)
     if name in ("step_median_us", "step_p99_us"):
         return f"{_three_figures(value)} µs" if value < 1000 else f"{_three_figures(value / 1000)} ms"

@@ -20,7 +20,7 @@ from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief
 from ..datasets.trajectory import Trajectory
 from .imu import BLOCK, compile_rig, first_sample
-from .innovation import gate_widths, normalised_innovations
+from .innovation import INNOVATION, gate_widths, judge
 from .interface import FACTORS, Diverged, Factors, Gate, Inflation
 from .records import as_belief, as_record, split, with_rate_noise
 
@@ -158,8 +158,10 @@ class FilterPass:
 
     def _likely(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
         """Return the readings that pass their gates, and count the others."""
-        nis, dof = normalised_innovations(self._state, self._kalman.error_covariance(self._state), self._rig, readings)
-        beyond = nis > widths[readings["kind"], dof]
+        predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
+        predicted["P"][0] = self._kalman.error_covariance(self._state)
+        judge(readings, predicted, self._rig, table)
+        beyond = table["nis"] > widths[readings["kind"], table["dof"]]
         if not beyond.any():
             return readings
         outliers.update(f"outliers_{SENSOR[kind]}" for kind in readings["kind"][beyond].tolist())
@@ -195,9 +197,10 @@ class FilterPass:
 
 
 def _insert(epochs: list[Epoch], reading: Any) -> list[Epoch]:
-    """Return the epochs with `reading` at its time, splitting the one that it falls into."""
+    """Return the epochs with `reading` in the last one of its time, splitting the one that it falls into."""
     t_ns = int(reading["t_ns"])
-    k = next(i for i, epoch in enumerate(epochs) if epoch.t_ns >= t_ns)
+    same_time = [i for i, epoch in enumerate(epochs) if epoch.t_ns == t_ns]
+    k = same_time[-1] if same_time else next(i for i, epoch in enumerate(epochs) if epoch.t_ns > t_ns)
     epoch, row = epochs[k], np.array([reading])
     if epoch.t_ns == t_ns:
         split_up = [epoch._replace(readings=np.concatenate([epoch.readings, row]))]

@@ -11,7 +11,8 @@ import pytest
 from fathom.bench.experiment import Experiment, ExperimentError, shipped_experiments
 from fathom.bench.runner import Worker, run_experiment, work
 from fathom.bench.store import load_runs
-from fathom.bench.table import failures, summarise
+from fathom.bench.summary import summarise
+from fathom.bench.table import failures
 
 SHORT = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
 PLUGIN = '''

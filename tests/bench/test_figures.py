@@ -19,7 +19,8 @@ from fathom.bench.figures import (
 )
 from fathom.bench.runner import Bench, Task
 from fathom.bench.store import COLUMNS
-from fathom.bench.table import print_table, records, summarise, write_table
+from fathom.bench.summary import records, summarise
+from fathom.bench.table import print_table, write_table
 from rich.console import Console
 
 LABELS = ("dead-reckoning", "eskf")

@@ -7,13 +7,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from fathom.bench.run import COSTS, SCORES, Scoring, costs, run_log, score_ticks, scores, warm_up
+from fathom.bench.run import (
+    COSTS,
+    INNOVATIONS,
+    SCORES,
+    Scoring,
+    costs,
+    innovation_dof,
+    innovation_scores,
+    run_log,
+    score_ticks,
+    scores,
+    warm_up,
+)
 from fathom.datasets import Belief, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import Epoch
 from fathom.datasets.log import ImuStream
-from fathom.datasets.scenario import Scenario
+from fathom.datasets.scenario import DvlSpec, GpsSpec, Scenario
 from fathom.datasets.simulator import simulate
 from fathom.estimators import FACTORS, Diverged, create
+from scipy.stats import chi2
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +107,7 @@ def test_a_constant_offset_is_the_ate_and_leaves_the_rpe_at_zero(log: Log) -> No
     assert row["rotation_rmse_deg"] == pytest.approx(0.0, abs=1e-5)
     assert row["rpe_rmse_m"] == pytest.approx(0.0, abs=1e-9)
     assert row["velocity_rmse_m_s"] == pytest.approx(0.0, abs=1e-12)
-    assert row["anees_position"] == pytest.approx((3**2 + 4**2) / 2**2)
+    assert row["nees_position"] == pytest.approx((3**2 + 4**2) / 2**2)
     assert set(row) == set(SCORES)
 
 
@@ -102,13 +115,13 @@ def test_alignment_forgives_an_offset_and_then_the_covariance_is_not_judged(log:
     estimate = run_log(log, Fake(truthful(log, (3.0, 4.0, 0.0)))).online
     row = scores(log, estimate, Scoring(align="yaw"))
     assert row["ate_rmse_m"] == pytest.approx(0.0, abs=1e-8)
-    assert row["anees_position"] is None
+    assert row["nees_position"] is None
 
 
 def test_covariances_are_not_judged_against_another_filters_output(log: Log) -> None:
     reference = replace(log, truth_kind="reference")
     row = scores(reference, run_log(reference, Fake(truthful(log))).online)
-    assert row["anees_position"] is None
+    assert row["nees_position"] is None
     assert row["ate_rmse_m"] == pytest.approx(0.0)
 
 
@@ -167,7 +180,7 @@ def test_an_estimator_without_covariance_is_none_the_worse(log: Log) -> None:
     assert result.status == "done"
     assert result.online is not None
     assert result.online.P is None
-    assert scores(log, result.online)["anees_position"] is None
+    assert scores(log, result.online)["nees_position"] is None
 
 
 def test_a_pass_may_reuse_its_arrays(log: Log) -> None:
@@ -304,7 +317,7 @@ def test_scores_that_a_buoys_truth_cannot_give_are_absent(log: Log) -> None:
     buoy = Trajectory(log.truth.t_ns, np.full_like(log.truth.R_WB, np.nan), p)
     row = scores(replace(log, truth=buoy), run_log(log, Fake(truthful(log, (3, 4, 7)))).online, Scoring(dims="2d"))
     assert row["ate_rmse_m"] == pytest.approx(5.0)
-    absent = ("rotation_rmse_deg", "heading_rmse_deg", "velocity_rmse_m_s", "rpe_rmse_m", "anees_position")
+    absent = ("rotation_rmse_deg", "heading_rmse_deg", "velocity_rmse_m_s", "rpe_rmse_m", "nees_position")
     assert [row[name] for name in absent] == [None] * len(absent)
 
 
@@ -313,3 +326,128 @@ def test_a_warm_estimator_does_not_compile_in_its_first_step(log: Log) -> None:
     warm_up(estimator)
     step_ns = run_log(log, estimator).step_ns
     assert step_ns[0] < 1000 * np.median(step_ns)
+
+
+# -- honesty ----------------------------------------------------------------------------------------------------------
+
+
+def test_nees_of_every_block_and_coverage_are_of_the_errors_there_are(log: Log) -> None:
+    row = scores(log, run_log(log, Fake(truthful(log, (1.0, 3.0, 5.0)))).online)  # ½, 1½ and 2½ σ
+    assert row["nees_position"] == row["nees_all"] == pytest.approx(35 / 4)
+    assert [row[f"nees_{block}"] for block in ("attitude", "velocity", "biases")] == pytest.approx([0] * 3, abs=1e-9)
+    assert [row[f"within_{k}sigma_position"] for k in (1, 2, 3)] == pytest.approx([1 / 3, 2 / 3, 1])
+    assert [row[f"within_{k}sigma_all"] for k in (1, 2, 3)] == pytest.approx([13 / 15, 14 / 15, 1])
+    assert row["n_not_positive"] == 0
+
+
+def test_a_covariance_that_is_none_is_counted_and_spares_the_blocks_that_are(log: Log) -> None:
+    honest, broken = truthful(log, (1.0, 3.0, 5.0)), 4 * np.eye(15)
+    broken[14, 14] = -1e-9
+    row = scores(log, run_log(log, Fake(lambda t_ns: (honest(t_ns)[0], broken))).online)
+    assert row["n_not_positive"] == 30
+    assert (row["nees_all"], row["nees_biases"]) == (None, None)
+    assert row["nees_position"] == pytest.approx(35 / 4)
+
+
+def test_a_covariance_kept_now_and_then_is_judged_then(log: Log) -> None:
+    online = run_log(log, Fake(truthful(log, (1.0, 3.0, 5.0)))).online
+    assert online is not None
+    assert online.P is not None
+    P = np.where((np.arange(30) % 7 == 0)[:, None, None], online.P, np.nan)
+    row = scores(log, replace(online, P=P))
+    assert row["nees_all"] == pytest.approx(35 / 4)
+    assert row["within_1sigma_position"] == pytest.approx(1 / 3)
+    nowhere = scores(log, replace(online, P=P * np.nan))
+    assert [nowhere[name] for name in ("nees_all", "within_1sigma_all")] == [None, None]
+
+
+@dataclass(frozen=True)
+class Believing(Fake):
+    """A fake that takes sensors for better or worse than they are."""
+
+    inflate: dict[str, float] | None = None
+
+
+def test_who_knows_the_truth_has_the_sensors_noise_for_innovations(log: Log) -> None:
+    """Theory by another road than any filter's: r is the reading's own error, and S its own covariance."""
+    result = run_log(log, Believing(truthful(log, sigma=1e-9), inflate={"heading": 0.5}), nis=True)
+    dof = innovation_dof(result)
+    assert dof == {"dvl": 450, "depth": 300, "gps": 54, "heading": 150}
+    assert result.nis is not None
+    assert result.nis["dof"].sum() == sum(dof.values())
+    assert (np.diff(result.nis["t_ns"]) >= 0).all()
+    row = innovation_scores(result)
+    assert set(row) == set(INNOVATIONS)
+    for sensor, inflated in {"dvl": 1, "depth": 1, "gps": 1, "heading": 0.5}.items():
+        low, high = chi2.interval(0.999, dof[sensor])
+        assert low < row[f"nis_{sensor}"] * dof[sensor] * inflated**2 < high, sensor
+
+
+def test_nis_is_absent_without_covariance_and_where_it_was_not_asked_for(log: Log) -> None:
+    for result in (run_log(log, create("dead-reckoning"), nis=True), run_log(log, Fake(truthful(log)))):
+        assert result.status == "done"
+        assert set(innovation_scores(result).values()) == {None}
+        assert innovation_dof(result) == {}
+    assert result.nis is None
+
+
+DELAYED = {"dvl": DvlSpec(delay_s=0.31), "gps": GpsSpec(delay_s=0.83)}
+
+
+def test_readings_that_come_late_are_counted_and_not_judged(log: Log) -> None:
+    late = simulate(Scenario(duration_s=30.0, **DELAYED), seed=3)
+    result = run_log(late, Fake(truthful(late, sigma=1e-9)), nis=True)
+    assert innovation_dof(result).keys() == {"depth", "heading"}
+    heard = sum(int((s.received_ns <= late.imu.t_ns[-1]).sum()) for s in (late.dvl, late.gps))
+    assert result.counts["nis_late"] == heard > 100
+    assert result.counts["nis_undefined"] == 0
+
+
+def test_a_belief_under_which_no_reading_is_possible_is_counted(log: Log) -> None:
+    honest = truthful(log)
+    result = run_log(log, Fake(lambda t_ns: (honest(t_ns)[0], -np.eye(15))), nis=True)
+    assert result.counts["nis_undefined"] == 150 + 300 + 18 + 150
+    assert set(innovation_scores(result).values()) == {None}
+
+
+def test_a_step_in_halves_is_timed_as_one_and_the_belief_between_is_not_charged(log: Log) -> None:
+    class Slow(FakePass):
+        def belief(self) -> Belief:
+            time.sleep(0.004)
+            return super().belief()
+
+    class SlowFake(Fake):
+        def begin(self, prior: Belief, rig: Rig) -> FakePass:
+            return Slow(self, prior)
+
+    seen: list[Epoch] = []
+    whole = run_log(log, Fake(truthful(log), seen=seen))
+    halves: list[Epoch] = []
+    result = run_log(log, SlowFake(truthful(log), lambda k: time.sleep(0.001), seen=halves), nis=True)
+    assert len(result.step_ns) == len(whole.step_ns) == len(seen) < len(halves)
+    assert (result.duration_s, result.imu_samples) == (whole.duration_s, whole.imu_samples)
+    assert 2.0e6 < np.median(result.step_ns) < 3.9e6  # two sleeps of a step, and none of a belief
+    assert np.array_equal(np.concatenate([e.imu for e in halves]), np.concatenate([e.imu for e in seen]))
+    assert np.array_equal(np.concatenate([e.readings for e in halves]), np.concatenate([e.readings for e in seen]))
+    assert not [e for e in halves if len(e.imu) and len(e.readings)]
+    assert [e.t_ns for e in halves if e.tick] == [e.t_ns for e in seen if e.tick]
+
+
+@pytest.mark.parametrize(
+    ("name", "readings"),
+    [("eskf", {}), ("eskf", DELAYED), ("iekf", {}), ("rts", {}), ("rts", DELAYED), ("fls", {})],
+    ids=lambda value: value if isinstance(value, str) else "delayed" if value else "in-time",
+)
+def test_being_judged_changes_nothing_of_what_is_said(name: str, readings: dict[str, object]) -> None:
+    log = simulate(Scenario(duration_s=40.0, **readings), seed=4)
+    plain, judged = run_log(log, create(name)), run_log(log, create(name), nis=True)
+    assert judged.status == "done"
+    assert plain.counts == {name: n for name, n in judged.counts.items() if not name.startswith("nis_")}
+    for output, track in plain.outputs.items():
+        again = judged.outputs[output]
+        assert np.array_equal(again.t_ns, track.t_ns)
+        worst = max(np.abs(track.state(k).local(again.state(k))).max() for k in range(len(track)))
+        assert worst < 1e-9, output
+        assert track.P is not None
+        assert again.P is not None
+        assert np.allclose(again.P, track.P, rtol=1e-9, atol=1e-15, equal_nan=True)

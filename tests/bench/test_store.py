@@ -85,6 +85,23 @@ def test_a_store_of_an_older_version_gains_columns_and_keeps_rows(tmp_path: Path
     assert table["ate_rmse_m"].isna().tolist() == [True, False]
 
 
+def test_an_older_store_is_read_with_what_it_calls_otherwise_or_lacks(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as old, old:
+        columns = "experiment TEXT, log TEXT, label TEXT, seed INTEGER, output TEXT, status TEXT, anees_position REAL"
+        old.execute(f"CREATE TABLE runs ({columns})")
+        old.execute("INSERT INTO runs VALUES ('e', 'l', 'old', 1, 'online', 'done', 2.5)")
+    table = load_runs(tmp_path)  # read only: nothing is renamed
+    assert list(table.columns) == list(COLUMNS)
+    assert table["nees_position"].isna().all()
+    with Store(tmp_path / "runs.sqlite") as store:
+        store.write([row(nis_dvl=1.25, nis_dof='{"dvl": 900}', nees_at='{"t_s": [1.0]}')])
+    table = load_runs(tmp_path)
+    assert table["nees_position"].tolist()[0] == 2.5
+    assert table["nis_dvl"].tolist()[1] == 1.25
+    assert table["nees_at"].tolist()[1] == '{"t_s": [1.0]}'
+    assert table["nis_dof"].isna().tolist() == [True, False]
+
+
 def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path: Path) -> None:
     file = tmp_path / "runs.sqlite"
     file.write_text("my thesis\n" * 1000)

@@ -8,18 +8,13 @@ import numpy as np
 import pytest
 from fathom.bench.metrics import ate
 from fathom.bench.run import run_log
-from fathom.datasets import Belief, Log
-from fathom.datasets.epochs import KIND, READING
+from fathom.datasets import Log
+from fathom.datasets.epochs import KIND
 from fathom.datasets.log import GpsStream
 from fathom.datasets.scenario import DvlSpec, Scenario
 from fathom.datasets.simulator import simulate
 from fathom.estimators import create
-from fathom.estimators.eskf_filterpy import stack
-from fathom.estimators.imu import compile_rig
-from fathom.estimators.innovation import gate_widths, normalised_innovations
-from fathom.estimators.interface import FACTORS
-from fathom.estimators.records import as_record
-from paths import random_rig, random_state
+from fathom.estimators.innovation import gate_widths
 from scipy.stats import binom, chi2
 
 FILTERS = ["eskf", "eskf-filterpy", "iekf", "ukf", "rts"]
@@ -33,26 +28,6 @@ def with_gps_outliers(log: Log, every: int, by_m: float) -> tuple[Log, Log, int]
     sparse = GpsStream(gps.t_ns[~bad], gps.received_ns[~bad], gps.z[~bad], gps.sigma[~bad])
     heard = int((bad & (gps.received_ns <= log.imu.t_ns[-1])).sum())
     return replace(log, gps=dirty), replace(log, gps=sparse), heard
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_normalised_innovations_are_those_of_the_textbook(seed: int) -> None:
-    """Bar-Shalom's eq. (5.4.2-5) by dense inverses, with correlated noise, a missing axis and a random rig."""
-    rng = np.random.default_rng(seed)
-    rig = compile_rig(random_rig(rng), FACTORS, {"dvl": 1.7})
-    M = rng.normal(size=(3, 3))
-    rig["rate_cov"] = 1e-3 * M @ M.T
-    A = rng.normal(size=(15, 15))
-    belief = Belief(0, random_state(rng), 1e-3 * A @ A.T)
-    readings = np.zeros(4, READING)
-    for row, (kind, n) in zip(readings, [("dvl", 3), ("depth", 1), ("gps", 2), ("heading", 1)], strict=True):
-        row["kind"], row["sigma"] = KIND[kind], np.inf
-        row["sigma"][:n], row["z"][:3] = rng.uniform(0.01, 0.1, n), rng.normal(size=3)
-    nis, dof = normalised_innovations(as_record(belief), belief.P, rig, readings)
-    assert dof.tolist() == [3, 1, 2, 1]
-    for m in range(4):
-        r, H, C = stack(as_record(belief), rig, readings[m : m + 1])
-        assert nis[m] == pytest.approx(r @ np.linalg.inv(H @ belief.P @ H.T + C) @ r, rel=1e-9)
 
 
 def test_widths_are_quantiles_of_chi_square_and_open_where_nothing_is_said() -> None:

@@ -21,7 +21,7 @@ RUNS = {
     "fls": ("fls", {"lag_s": 3.0}),
     "fls preintegrated": ("fls", {"lag_s": 3.0, "dvl": ["preintegrated-loose"]}),
 }
-SHOWN = ("ate_rmse_m", "heading_rmse_deg", "velocity_rmse_m_s", "drift_end_percent", "rpe_rmse_m", "anees_position")
+SHOWN = ("ate_rmse_m", "heading_rmse_deg", "velocity_rmse_m_s", "drift_end_percent", "rpe_rmse_m", "nees_position")
 
 
 def dive(label: str) -> dict[str, dict[str, float | None]]:

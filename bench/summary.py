@@ -1,0 +1,157 @@
+"""The rows of the store as people read them: one record per log, estimator and output, its seeds pooled."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from statistics import fmean, median
+from typing import Any, TypeAlias
+
+import pandas as pd
+
+from .consistency import anees_of, pooled_nis
+from .metrics import BLOCKS, pooled_rmse
+from .run import INNOVATIONS, SCORES
+
+Record: TypeAlias = dict[str, Any]
+"""One row, absent values being None."""
+
+POOLED = {"ate_rmse_m": "n_scored", "heading_rmse_deg": "n_scored", "rpe_rmse_m": "n_rpe", "drms_m": "n_scored"}
+"""Root mean squares are pooled over seeds before the root, each with its own count."""
+
+MEAN = (
+    "drift_end_percent",
+    "drift_max_percent",
+    "outage_percent",
+    "segment_percent",
+    "cep50_m",
+    *(name for name in SCORES if name.startswith(("nees_", "within_"))),
+)
+MEDIAN = ("step_median_us", "step_p99_us", "real_time_factor", "us_per_imu_sample", "peak_mb")
+SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
+SEEDS_ENOUGH = 5
+"""With fewer seeds an interval for ANEES is so wide that only NIS, where it was asked for, is worth a table."""
+
+COUNTS = {
+    "readings": ("readings",),
+    "late_used": ("late_used", "replayed"),  # by a smoother, by a filter that went back
+    "late_dropped": ("late",),
+    "carried": ("carried",),
+}
+"""What estimators did with readings that came late or between keyframes; summed over seeds."""
+
+OUTLIERS = "outliers_"
+"""Counts of this prefix say how many readings an estimator took for outliers, or weighed down."""
+
+
+def records(rows: pd.DataFrame) -> list[Record]:
+    """Return the rows of a table of runs as plain Python."""
+    return [
+        {str(name): None if pd.isna(value) else value for name, value in row.items()} for row in rows.to_dict("records")
+    ]
+
+
+def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Record]]:
+    """Return the rows by these keys, in order of first appearance."""
+    found: dict[tuple[Any, ...], list[Record]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return found
+
+
+def summarise(rows: pd.DataFrame) -> list[Record]:
+    """Return one record per log, estimator and output, over the seeds that came to their end.
+
+    Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES, coverage are means; of
+    costs, the median is taken. `runs` and `done` say over how many; where none is done, the numbers are None. `anees_*`
+    is the mean over the fixed times of `consistency`, by degree of freedom, with the number of those times at which it
+    lies above and below its interval.
+    """
+    every = records(rows)
+    runs = {key: len(groups(of, "seed")) for key, of in groups(every, "log", "label").items()}
+    summary = []
+    for (log, label, output), group in groups(every, "log", "label", "output").items():
+        done = [row for row in group if row["status"] == "done"]
+        record: Record = {"log": log, "label": label, "output": output}
+        record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
+        record |= _rpe_step(group)
+        record |= {"runs": runs[log, label], "done": len(done)}
+        record |= {count: sum(row[count] or 0 for row in done) for count in ("n_scored", "n_rpe")}
+        record |= {name: _pooled(done, name, count) for name, count in POOLED.items()}
+        record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
+        record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
+        record |= _honesty(done)
+        record |= {name: _counted(done, of) for name, of in COUNTS.items()}
+        record |= {name: _counted(done, [name]) for name in _outliers(every)}
+        summary.append(record)
+    return summary
+
+
+def _rpe_step(group: Sequence[Record]) -> Record:
+    """Return which RPE a group's is, from its spec; None where that does not tell."""
+    scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
+    return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
+
+
+def _pooled(done: Sequence[Record], name: str, count: str) -> float | None:
+    known = [row for row in done if row[name] is not None]
+    return pooled_rmse([row[name] for row in known], [row[count] for row in known]) if known else None
+
+
+def _over_seeds(statistic: Callable[[list[float]], float], done: Sequence[Record], name: str) -> float | None:
+    known = [row[name] for row in done if row[name] is not None]
+    return statistic(known) if known else None
+
+
+def _honesty(done: Sequence[Record]) -> Record:
+    """Return NIS by sensor, and ANEES by block with its verdicts."""
+    record: Record = dict.fromkeys(INNOVATIONS)
+    record |= {f"nis_{sensor}": float(nis.value[0]) for sensor, nis in pooled_nis(done).items()}
+    found = anees_of([row["nees_at"] for row in done])
+    for block in BLOCKS:
+        average = found.get(block)
+        record[f"anees_{block}"] = None if average is None else float(average.value.mean())
+        record[f"anees_{block}_above"] = None if average is None else int(average.above.sum())
+        record[f"anees_{block}_below"] = None if average is None else int(average.below.sum())
+    record["anees_times"] = max((len(average) for average in found.values()), default=None)
+    record["n_not_positive"] = sum(int(row["n_not_positive"] or 0) for row in done)
+    return record
+
+
+CONSISTENCY = ("log", "label", "output", "score", "t_s", "seeds", "dof", "per_dof", "low", "high", "verdict")
+
+
+def consistency(rows: pd.DataFrame) -> list[Record]:
+    """Return one record per ANEES (log, estimator, output, block, time) and per pooled NIS, with its interval."""
+    table = []
+    for (log, label, output), group in groups(records(rows), "log", "label", "output").items():
+        done = [row for row in group if row["status"] == "done"]
+        named = {f"nees_{block}": average for block, average in anees_of([row["nees_at"] for row in done]).items()}
+        named |= {f"nis_{sensor}": average for sensor, average in pooled_nis(done).items()}
+        for name, average in named.items():
+            for k in range(len(average)):
+                verdict = "above" if average.above[k] else "below" if average.below[k] else "inside"
+                each = {"t_s": average.t_s[k], "seeds": average.runs[k], "dof": average.dof[k]}
+                each |= {"per_dof": average.value[k], "low": average.low[k], "high": average.high[k]}
+                table.append(
+                    {"log": log, "label": label, "output": output, "score": name} | each | {"verdict": verdict}
+                )
+    return table
+
+
+def is_judged(summary: Sequence[Record]) -> bool:
+    """Return whether there is enough of honesty to show: some NIS, or ANEES over enough seeds."""
+    enough = [row["done"] >= SEEDS_ENOUGH and row["anees_times"] is not None for row in summary]
+    return any(enough) or any(row[name] is not None for row in summary for name in INNOVATIONS)
+
+
+def _counted(done: Sequence[Record], names: Iterable[str]) -> int:
+    """Return the sum of these counts over the runs."""
+    counts = [json.loads(row["counts"] or "{}") for row in done]
+    return sum(of_run.get(name, 0) for of_run in counts for name in names)
+
+
+def _outliers(rows: Iterable[Record]) -> list[str]:
+    """Return the names of all counts of outliers that any run has."""
+    names = {name for row in rows for name in json.loads(row["counts"] or "{}") if name.startswith(OUTLIERS)}
+    return sorted(names)
