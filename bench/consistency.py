@@ -66,8 +66,8 @@ class Average:
 def nees_at(log: Log, estimate: Trajectory, epochs: int) -> dict[str, list[float | None]]:
     """Return the NEES of each block at times fixed beforehand, with those times.
 
-    The times are the middles of `epochs` equal parts of the log, whatever the estimate; each takes the nearest pose of
-    its part that has a covariance. So a smoother that keeps few covariances with hindsight has fewer times.
+    The times are the middles of `epochs` equal parts of the log, whatever the estimate; each takes the pose of its part
+    that is nearest (of two, the earlier) and has a covariance. So a smoother that keeps few covariances with hindsight has fewer times.
 
     Args:
         log: its truth must be one, and known.
@@ -85,18 +85,19 @@ def nees_at(log: Log, estimate: Trajectory, epochs: int) -> dict[str, list[float
         return {}
     if estimate.P is None:
         return {}
-    t_s = (estimate.t_ns - log.start_ns) * 1e-9
+    age_ns = estimate.t_ns - log.start_ns
     kept = np.flatnonzero(np.isfinite(estimate.P).all(axis=(1, 2)))
-    part_s = log.duration_s / epochs
+    half_ns = (int(log.imu.t_ns[-1]) - log.start_ns) // (2 * epochs)
     found: dict[int, int] = {}
     for k in range(epochs):
-        inside = kept[(t_s[kept] > k * part_s) & (t_s[kept] <= (k + 1) * part_s)]
+        middle_ns = (2 * k + 1) * half_ns
+        inside = kept[(age_ns[kept] > middle_ns - half_ns) & (age_ns[kept] <= middle_ns + half_ns)]
         if len(inside):
-            found[k] = int(inside[np.abs(t_s[inside] - (k + 0.5) * part_s).argmin()])
+            found[k] = int(inside[np.abs(age_ns[inside] - middle_ns).argmin()])
     if not found:
         return {}
     rows = np.array(list(found.values()))
-    columns = {"t_s": t_s[rows]}
+    columns = {"t_s": age_ns[rows] * 1e-9}
     for block in BLOCKS:
         with suppress(ScoreError):
             columns[block] = nees(truth.select(rows), estimate.select(rows), block)
