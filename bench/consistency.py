@@ -66,8 +66,9 @@ class Average:
 def nees_at(log: Log, estimate: Trajectory, epochs: int) -> dict[str, list[float | None]]:
     """Return the NEES of each block at times fixed beforehand, with those times.
 
-    The times are the middles of `epochs` equal parts of the log, whatever the estimate; each takes the pose of its part
-    that is nearest (of two, the earlier) and has a covariance. So a smoother that keeps few covariances with hindsight has fewer times.
+    The times are the middles of `epochs` equal parts of the log, whatever the estimate. Each takes the pose of its part
+    that is nearest (of two, the earlier) and has a covariance; so a smoother that keeps few covariances with hindsight
+    has fewer times.
 
     Args:
         log: its truth must be one, and known.

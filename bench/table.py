@@ -28,6 +28,8 @@ SHOWN = {
     "step_p99_us": "\np99",
     "real_time_factor": "× real\ntime",
 }
+BLOCK_HEADINGS = ("ANEES   \npos", "\natt", "\nvel", "\nbias", "\nall")
+NIS_HEADINGS = {"nis_dvl": "dvl", "nis_depth": "depth", "nis_gps": "gps", "nis_heading": "head"}
 ABSENT = "–"
 CAUSE_WIDTH = 160
 
@@ -115,11 +117,9 @@ def _honesty(summary: Sequence[Record]) -> Table | None:
         f"ANEES: over the runs, at {times} fixed times; ▲k, ▼k: at k of them above, below the chi-square interval\n"
         "NIS: over all readings that came in time. Position within 1, 2, 3 σ: 68, 95, 99.7 % are due"
     )
-    blocks = [f"ANEES\n{block}   " if block == "position" else f"\n{block}   " for block in BLOCKS]
-    nis = [("NIS\n" if k == 0 else "\n") + name.removeprefix("nis_") for k, name in enumerate(sensors)]
-    table = _empty(
-        f"{summary[0]['log']}: honesty", caption, ("sees\nahead", "runs", *blocks, *nis, "within\n1, 2, 3 σ %")
-    )
+    headings = ["sees\nahead", "runs", *(f"{name}   " for name in BLOCK_HEADINGS)]
+    headings += [f"{'' if k else 'NIS'}\n{NIS_HEADINGS[name]}" for k, name in enumerate(sensors)]
+    table = _empty(f"{summary[0]['log']}: honesty", caption, [*headings, "within\n1, 2, 3 σ"])
     for (label,), of_label in groups(summary, "label").items():
         for k, row in enumerate(of_label):
             numbers = [_anees(row, block) for block in BLOCKS]

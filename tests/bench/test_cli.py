@@ -51,6 +51,7 @@ def test_run_writes_store_table_and_figures_and_prints_the_table(tmp_path: Path)
     assert "alignment: none" in out
     folder = tmp_path / "r" / "short"
     assert pd.read_csv(folder / "table.csv")["done"].tolist() == [1, 1]
+    assert pd.read_csv(folder / "consistency.csv")["seeds"].unique().tolist() == [1]
     assert (folder / "runs.sqlite").is_file()
     assert len(list((folder / "figures").glob("*.pdf"))) == 3
 
@@ -149,7 +150,8 @@ def test_list_says_which_estimator_cannot_be_loaded(monkeypatch: pytest.MonkeyPa
 def test_list_names_what_there_is() -> None:
     assert "eskf: factors" in call("list", "estimators")[1]
     assert "filter_vs_smoother: " in call("list", "experiments")[1]
-    assert "ate_rmse_m: " in call("list", "scores")[1]
+    for score in ("ate_rmse_m", "nees_velocity", "within_2sigma_all", "nis_dvl", "step_median_us"):
+        assert f"{score}: " in call("list", "scores")[1]
     assert "ictineu_stpere_2004" in call("list", "logs")[1]
     assert call("list", "fish")[0] == 2
 

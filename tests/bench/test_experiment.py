@@ -151,6 +151,8 @@ def test_the_spec_of_a_recorded_run_knows_its_description_and_whether_it_was_rep
         ({"seeds": [2**63]}, ["seeds[0]", "less than"]),
         ({"scores": {"rpe_delta": 1.5, "rpe_unit": "frames"}}, ["scores", "whole in frames", "1.5"]),
         ({"scores": {"score_period_s": 1e-12}}, ["scores.score_period_s", "0.001"]),
+        ({"scores": {"nees_epochs": 0}}, ["scores.nees_epochs", "greater than or equal to 1"]),
+        ({"scores": {"nsi": True}}, ["scores.nsi", "did you mean 'nis'"]),
         ({"seeds": [1, 1]}, ["seed 1", "twice"]),
         ({"scores": {"align": "jaw"}}, ["scores.align", "'jaw'", "yaw"]),
         ({"scores": {"rpe_detla": 1}}, ["scores.rpe_detla", "did you mean 'rpe_delta'"]),
@@ -268,10 +270,10 @@ def test_seeds_are_pooled_before_the_root(tmp_path: Path) -> None:
     assert summary["ate_rmse_m"] != pytest.approx(rows["ate_rmse_m"].mean())
 
 
-@pytest.mark.parametrize("name", ["figures", "trajectories", "table.csv"])
+@pytest.mark.parametrize("name", ["figures", "trajectories", "table.csv", "consistency.csv"])
 def test_what_is_in_the_way_of_results_is_named_before_anything_runs(tmp_path: Path, name: str) -> None:
     folder = tmp_path / "t"
-    if name == "table.csv":
+    if name.endswith(".csv"):
         (folder / name).mkdir(parents=True)
     else:
         folder.mkdir()

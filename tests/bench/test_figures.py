@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pandas as pd
 import pytest
 from fathom.bench.experiment import Experiment
 from fathom.bench.figures import (
+    draw_anees,
     draw_costs,
     draw_errors,
     draw_figures,
@@ -20,8 +22,9 @@ from fathom.bench.figures import (
 from fathom.bench.runner import Bench, Task
 from fathom.bench.store import COLUMNS
 from fathom.bench.summary import records, summarise
-from fathom.bench.table import print_table, write_table
+from fathom.bench.table import print_table, write_consistency, write_table
 from rich.console import Console
+from scipy.stats import chi2
 
 LABELS = ("dead-reckoning", "eskf")
 
@@ -166,3 +169,115 @@ def test_a_log_whose_readings_lay_outside_is_named_with_their_number(rows: pd.Da
     counts = '{"readings": 100, "readings_outside": 90}'
     lost = "lawnmower-tactical: 90 of 100 readings lay outside the log"
     assert printed(rows.assign(counts=counts), tmp_path).count(lost) == 1
+
+
+# -- honesty ----------------------------------------------------------------------------------------------------------
+
+JUDGED = ("dead-reckoning", "eskf", "overconfident", "rts")
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path]:
+    """Five seeds of a short dive, with innovations; one filter takes its DVL for five times better than it is."""
+    folder = tmp_path_factory.mktemp("judged")
+    wrong = {"name": "eskf", "label": "overconfident", "with": {"inflate": {"dvl": 0.2}}}
+    plan = Experiment.from_dict(
+        {
+            "name": "h",
+            "logs": [{"scenario": {"duration_s": 30, "gps": {"delay_s": 0.5}}}],
+            "estimators": [{"name": "dead-reckoning"}, {"name": "eskf"}, wrong, {"name": "rts"}],
+            "seeds": [1, 2, 3, 4, 5],
+            "scores": {"nis": True, "nees_epochs": 6},
+        }
+    )
+    bench = Bench()
+    found = [row for run in plan.runs() for row in bench.execute(Task(plan, run, folder))]
+    return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
+
+
+def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+    rows, _ = judged
+    summary = {(row["label"], row["output"]): row for row in summarise(rows)}
+    honest, wrong = summary["eskf", "online"], summary["overconfident", "online"]
+    assert (honest["anees_times"], honest["anees_velocity_above"]) == (6, 0)
+    assert wrong["anees_velocity_above"] >= 5
+    assert wrong["nis_dvl"] > 5 > 1.2 > honest["nis_dvl"] > 0.8
+    assert honest["nis_gps"] is None  # it comes late
+    assert summary["rts", "hindsight"]["nis_dvl"] is None
+    text = printed(rows, tmp_path, 120)
+    lines = text[text.index("honesty") :].splitlines()
+    of = {label: next(line for line in lines if line.startswith(label)) for label in JUDGED}
+    assert f"▲{wrong['anees_velocity_above']}" in of["overconfident"]
+    assert "▲" not in of["eskf"]
+    assert "▼" not in of["eskf"]
+    assert f"{wrong['nis_dvl']:.2f}" in of["overconfident"]
+    shares = [100 * honest[f"within_{k}sigma_position"] for k in (1, 2, 3)]
+    assert of["eskf"].rstrip().endswith(f"{shares[0]:.0f} {shares[1]:.0f} {shares[2]:.1f}")
+    assert of["dead-reckoning"].count("–") == 5 + 3 + 1
+    assert "gps" not in lines[2]
+
+
+def test_the_widest_honesty_table_fits_120_columns(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+    rows, _ = judged
+    labels = rows["label"].replace({label: f"{label:-<24}" for label in JUDGED})
+    text = printed(rows.assign(label=labels, nis_gps=12.3, nis_dof='{"dvl": 900, "gps": 9}'), tmp_path, 120)
+    assert max(map(len, text.splitlines())) <= 120
+    assert "1, 2, 3 σ" in text
+    assert "…" not in text
+
+
+def test_few_seeds_without_nis_have_no_honesty_table_and_no_figure_of_it(rows: pd.DataFrame, tmp_path: Path) -> None:
+    assert "honesty" not in printed(rows, tmp_path)
+    assert "late readings" not in printed(rows, tmp_path)
+
+
+def test_the_csv_of_consistency_has_every_average_with_its_interval(
+    judged: tuple[pd.DataFrame, Path], tmp_path: Path
+) -> None:
+    rows, _ = judged
+    write_consistency(rows, tmp_path / "consistency.csv")
+    table = pd.read_csv(tmp_path / "consistency.csv")
+    of_eskf = table[(table["label"] == "eskf") & (table["score"] == "nees_all")]
+    assert of_eskf["dof"].tolist() == [75] * 6
+    assert of_eskf["low"].to_numpy() == pytest.approx(chi2.ppf(0.0005 / 6, 75) / 75)
+    assert of_eskf["t_s"].tolist() == [2, 7, 12, 17, 22, 27]
+    nis = table[(table["label"] == "eskf") & (table["score"] == "nis_dvl")].iloc[0]
+    assert (nis["seeds"], nis["dof"]) == (5, 5 * 450)
+    assert nis["high"] == pytest.approx(chi2.ppf(1 - 0.0005, 2250) / 2250)
+    verdicts = table.assign(verdict=table["verdict"]).groupby("label")["verdict"].value_counts()
+    assert verdicts["overconfident", "above"] >= 12
+    assert "dead-reckoning" not in set(table["label"])
+    assert ((table["per_dof"] > table["high"]) == (table["verdict"] == "above")).all()
+
+
+def test_the_figure_of_nees_has_a_line_per_output_and_the_band(judged: tuple[pd.DataFrame, Path]) -> None:
+    rows, folder = judged
+    files = {file.name for file in draw_figures(rows, folder)}
+    assert {"lawnmower-tactical-anees.pdf", "lawnmower-tactical-anees.png"} <= files
+    axes = draw_anees(records(rows), looks_of(JUDGED), "t").axes
+    assert [panel.get_ylabel() for panel in axes] == ["position", "attitude", "velocity", "biases", "all"]
+    averages = [line for line in axes[4].lines if len(line.get_xdata()) == 6]
+    assert len(averages) == 4  # eskf, overconfident, rts online and with hindsight
+    (band,) = axes[4].patches
+    low, high = chi2.interval(1 - 0.001 / 6, 75)
+    assert [band.get_y(), band.get_y() + band.get_height()] == pytest.approx([low / 75, high / 75])
+
+
+def test_what_became_of_late_readings_and_outliers_is_said(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+    rows, _ = judged
+    text = printed(rows, tmp_path, 120)
+    late = text[text.index("late readings and outliers") :].splitlines()
+    fixes = sum(json.loads(counts)["nis_late"] for counts in rows[rows["label"] == "eskf"]["counts"])
+    assert fixes > 50
+    assert next(line.split() for line in late if line.startswith("eskf"))[2:] == [str(fixes), "0", "0"]
+    gated = printed(rows.assign(counts='{"readings": 1000, "late": 3, "outliers_dvl": 20}'), tmp_path, 120)
+    assert "outliers" in gated
+    row = next(line.split() for line in gated[gated.index("late readings") :].splitlines() if line.startswith("rts"))
+    assert row[1:] == ["5,000", "0", "15", "0", "100"]
+
+
+def test_a_covariance_that_is_none_is_named(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+    rows, _ = judged
+    text = printed(rows.assign(n_not_positive=2.0), tmp_path, 120)
+    assert "lawnmower-tactical / rts hindsight: 10 covariances are not positive definite" in text
+    assert "not positive" not in printed(rows, tmp_path, 120)
