@@ -217,15 +217,16 @@ def draw_anees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fi
             widest = max(averages.values(), key=lambda average: (average.runs.max(), len(average)))
             axes.axhspan(widest.low.min(), widest.high.max(), color="black", alpha=0.12, linewidth=0)
         axes.axhline(1, color="black", linewidth=0.4)
-        axes.set_yscale("log")
+        _logarithmic(axes, "y")
         axes.set_ylabel(block)
     panels[-1].set_xlabel("time, s")
     runs = max((int(average.runs.max()) for of_line in lines.values() for average in of_line.values()), default=0)
     figure.suptitle(f"{title}: NEES by degree of freedom, mean of {runs} seeds", fontsize=10)
-    handles = [_handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(done, "label")]
+    drawn = dict.fromkeys(label for (label, _), of_line in lines.items() if of_line)
+    handles = [_handle(label, looks[label].marker, looks[label].colour, True) for label in drawn]
     if any(output == "hindsight" for _, output in lines):
         handles.append(_handle("with hindsight", "o", "black", False))
-    band = f"honest, but for {FALSE_ALARM:.1%} of figures"
+    band = f"{1 - FALSE_ALARM:.1%} of honest lines stay in here"
     handles.append(Line2D([], [], color="black", alpha=0.12, linewidth=6, label=band))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
@@ -254,7 +255,7 @@ def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
         axes.set_xlabel("computing, ms per second of voyage")
         axes.set_ylabel("ATE, m")
         axes.margins(0.12)
-        _logarithmic(axes)
+        _logarithmic(axes, "xy")
     handles = [_handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(summary, "label")]
     if any(row["output"] == "hindsight" for row in summary):
         handles.append(_handle("with hindsight", "o", "black", False))
@@ -262,10 +263,11 @@ def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
     return figure
 
 
-def _logarithmic(axes: Axes) -> None:
-    """Make both axes logarithmic, with plain numbers at 1, 2 and 5, over at least a factor of four."""
-    axes.set(xscale="log", yscale="log")
-    for axis in (axes.xaxis, axes.yaxis):
+def _logarithmic(axes: Axes, which: str) -> None:
+    """Make the axes "x", "y" or both logarithmic, with plain numbers at 1, 2 and 5, over at least a factor of four."""
+    for name in which:
+        axis = axes.xaxis if name == "x" else axes.yaxis
+        axes.set(**{f"{name}scale": "log"})
         low, high = axis.get_view_interval()
         middle = math.sqrt(low * high)
         axis.set_view_interval(min(low, middle / 2), max(high, middle * 2), ignore=True)
