@@ -480,7 +480,7 @@ def _honesty(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]
             shares = coverage(truth, estimate, block)
             row |= {f"within_{k}sigma_{block}": share for k, share in enumerate(shares, 1)}
     with suppress(ScoreError):
-        row["n_not_positive"] = len(not_positive(estimate))
+        row["n_not_positive"] = 0 if "nees_all" in row else len(not_positive(estimate))
     return row
 
 

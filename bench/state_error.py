@@ -85,9 +85,16 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
     except np.linalg.LinAlgError:
         row = int(np.flatnonzero(known)[np.argmin(np.linalg.eigvalsh(P[known])[:, 0])])
         raise ScoreError(f"nees: P of {block!r} is not positive definite at {t_ns[row]} ns") from None
-    whitened = np.linalg.solve(L, e[known][:, :, None])[:, :, 0]  # L w = e, so eᵀ P⁻¹ e = wᵀ w
-    score[known] = (whitened * whitened).sum(axis=1)
+    score[known] = (_solve_lower(L, e[known]) ** 2).sum(axis=1)  # L w = e, so eᵀ P⁻¹ e = wᵀ w
     return score
+
+
+def _solve_lower(L: Array, e: Array) -> Array:
+    """Return w (n, k) with L w = e, row by row of e, for lower triangles L (n, k, k)."""
+    w = np.empty_like(e)
+    for i in range(e.shape[1]):
+        w[:, i] = (e[:, i] - (L[:, i, :i] * w[:, :i]).sum(axis=1)) / L[:, i, i]
+    return w
 
 
 def coverage(
