@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -55,12 +56,12 @@ SPARSE = Scenario(
     dvl=DvlSpec(1.0),
     depth=DepthSpec(1.0),
     gps=GpsSpec(1.0),
-    heading=HeadingSpec(2.0),
+    heading=HeadingSpec(1.0),
 )
 PUNCTUAL_S = {"dvl": 0.0, "gps": 0.0, "heading": 0.0, "depth": 0.0}
 DELAYS_S = {"dvl": 1.5, "gps": 4.0, "heading": 0.5, "depth": 0.0}
 LATE = replace(SPARSE, **{name: replace(getattr(SPARSE, name), delay_s=delay) for name, delay in DELAYS_S.items()})
-TICKS_S = (2, 7, 12, 18)
+TICKS_S = (2, 7, 13)
 
 
 class Dense:
@@ -97,40 +98,39 @@ class Dense:
                     self.readings.append((k + 1, received_ns, H, C))
 
     def by_information(self, t_ns: int, now_ns: float) -> np.ndarray:
-        """P of the state at t_ns from all that is received by now_ns: the inverse of the whole information matrix."""
-        n, zero, one, k = len(self.states), np.zeros(15), np.eye(15), int(np.searchsorted(self.t_ns, t_ns))
+        """P of the state at t_ns from all that is received by now_ns: the inverse of the whole information matrix.
+
+        Of the states up to now_ns: those after are tied to nothing but each other.
+        """
+        n, k = (int(np.searchsorted(self.t_ns, at_ns, side="right")) for at_ns in (now_ns, t_ns - 1))
+        zero, one = np.zeros(15), np.eye(15)
         lines = [whitened(n, {0: one}, zero, self.P0)]
-        lines += [
-            whitened(n, {k: -F, k + 1: one}, zero, Q) for k, (F, Q) in enumerate(zip(self.F, self.Q, strict=True))
-        ]
-        lines += [whitened(n, {k: H}, np.zeros(len(C)), C) for k, at_ns, H, C in self.readings if at_ns <= now_ns]
-        A = np.concatenate(lines)[:, :-1]
+        lines += [whitened(n, {i: -self.F[i], i + 1: one}, zero, self.Q[i]) for i in range(n - 1)]
+        lines += [whitened(n, {i: H}, np.zeros(len(C)), C) for i, at_ns, H, C in self.readings if at_ns <= now_ns]
+        A, own = np.concatenate(lines)[:, :-1], slice(15 * k, 15 * k + 15)
         size = np.linalg.norm(A, axis=0)
         upper = np.linalg.qr(A / size, mode="r")
-        own = slice(15 * k, 15 * k + 15)
         part = scipy.linalg.solve_triangular(upper, np.eye(15 * n)[:, own], trans="T").T / size[own, None]
         return self.of_belief(k, part @ part.T)
 
     def by_conditioning(self, t_ns: int, now_ns: float) -> np.ndarray:
         """The same from the joint covariance of all states, conditioned on all readings at once; inverts no Q, no P."""
-        n, k = len(self.states), int(np.searchsorted(self.t_ns, t_ns))
-        step = np.eye(15 * n)
+        k, used = int(np.searchsorted(self.t_ns, t_ns)), [reading for reading in self.readings if reading[1] <= now_ns]
+        H_all, C_all = [], scipy.linalg.block_diag(*(C for *_, C in used))
+        for i, _, H, C in used:
+            H_all.append(np.zeros((len(C), 15 * len(self.states))))
+            H_all[-1][:, 15 * i : 15 * i + 15] = H
+        P, own, H = self.joint, slice(15 * k, 15 * k + 15), np.concatenate(H_all)
+        return self.of_belief(k, P[own, own] - P[own] @ H.T @ np.linalg.solve(H @ P @ H.T + C_all, H @ P[:, own]))
+
+    @cached_property
+    def joint(self) -> np.ndarray:
+        """Covariance of all states before any reading."""
+        tie = np.eye(15 * len(self.states))
         for i, F in enumerate(self.F):
-            step[15 * (i + 1) : 15 * (i + 2), 15 * i : 15 * (i + 1)] = -F
-        root = np.linalg.inv(step)
-        P = root @ scipy.linalg.block_diag(self.P0, *self.Q) @ root.T
-        used = [(i, H, C) for i, at_ns, H, C in self.readings if at_ns <= now_ns]
-        H_all, C_all = (
-            np.zeros((sum(len(C) for *_, C in used), 15 * n)),
-            scipy.linalg.block_diag(*(C for *_, C in used)),
-        )
-        begin = 0
-        for i, H, C in used:
-            H_all[begin : begin + len(C), 15 * i : 15 * i + 15] = H
-            begin += len(C)
-        own = slice(15 * k, 15 * k + 15)
-        gain = np.linalg.solve(H_all @ P @ H_all.T + C_all, H_all @ P[:, own]).T
-        return self.of_belief(k, P[own, own] - gain @ H_all @ P[:, own])
+            tie[15 * (i + 1) : 15 * (i + 2), 15 * i : 15 * (i + 1)] = -F
+        root = np.linalg.inv(tie)
+        return root @ scipy.linalg.block_diag(self.P0, *self.Q) @ root.T
 
     def of_belief(self, k: int, P: np.ndarray) -> np.ndarray:
         return with_rate_noise(Belief(0, self.states[k], P), self.rig).P
