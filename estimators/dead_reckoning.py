@@ -59,10 +59,10 @@ class DeadReckoningPass:
             if self._config.attitude == "heading":  # nothing turns between two headings
                 imu = imu.copy()
                 imu["w_WI_I"] = rate_bias
-            dp, _ = preintegrate_dvl(
+            displacement = preintegrate_dvl(
                 imu, self._t_ns, held_ns, self._v_WB_B[None], np.zeros((1, 3)), rate_bias, self._records, False
             )
-            self._p_WB_W = self._p_WB_W + self._R_WB @ dp
+            self._p_WB_W = self._p_WB_W + self._R_WB @ displacement["dp"][0]
             if self._config.attitude == "gyro":
                 for sample in imu:
                     self._R_WB = self._R_WB @ exp(self._rig.imu.R_BS @ (sample["w_WI_I"] - rate_bias) * sample["dt_s"])

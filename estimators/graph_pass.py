@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from ..datasets.epochs import DVL, IMU_SAMPLE, Epoch
@@ -34,16 +34,25 @@ from .gtsam_border import (
     preintegrate_imu,
     prior_factor,
     reading_factor,
+    tight_displacement_factor,
 )
 from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
 from .interface import FACTORS, Diverged, Factors, Inflation
 from .records import as_belief, as_record, split, with_rate_noise
 from .solvers import Solver
 
-DvlFactor = Literal["velocity", "preintegrated-loose"]
+DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
 LONGEST_SILENCE_S = 1.0
 """A first-order bias correction, and one factor's rounding, hold for about so long without a keyframe."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+def _once(dvl: frozenset[DvlFactor]) -> frozenset[DvlFactor]:
+    if dvl >= {"preintegrated-loose", "preintegrated-tight"}:
+        raise ValueError(
+            "preintegrated-loose and preintegrated-tight sum the same readings, so each would be used twice: name one"
+        )
+    return dvl
 
 
 @dataclass(frozen=True)
@@ -57,9 +66,12 @@ class GraphSmoother(ABC):
 
     Attributes:
         dvl: how DVL readings enter. "velocity": each by its own factor (eq. 4). "preintegrated-loose": summed to a
-            displacement from keyframe to keyframe (eq. 6). With both, the reading at a keyframe goes by its velocity
-            and the others are summed, so that none is used twice. A reading that comes after its interval was closed
-            goes by its velocity whatever is said here.
+            displacement from keyframe to keyframe (eq. 6), turned by the gyro at the bias of the moment, as if the IMU
+            factor had another gyro. "preintegrated-tight": the same displacement given the rotation between the
+            keyframes and the gyro bias, so that with the IMU factor each gyro sample counts once. One of these two
+            at most. With "velocity" beside it, the reading at a keyframe goes by its velocity and the others are
+            summed, so that none is used twice. A reading that comes after its interval was closed goes by its velocity
+            whatever is said here.
         dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
             straight, up to the reading at the interval's end (which so has a small part in two factors). Held, its
             covariance knows the DVL's and the gyro's noise but not what is lost by holding: on a vehicle that
@@ -76,7 +88,7 @@ class GraphSmoother(ABC):
         hindsight_covariance_s: period at which states with hindsight keep their covariance.
     """
 
-    dvl: Annotated[frozenset[DvlFactor], Field(min_length=1)] = frozenset({"velocity"})
+    dvl: Annotated[frozenset[DvlFactor], Field(min_length=1), AfterValidator(_once)] = frozenset({"velocity"})
     dvl_between: Literal["held", "straight"] = "held"
     keyframe_period_s: Positive | None = None
     keyframe_timeout_s: Positive = 0.5
@@ -100,7 +112,7 @@ class GraphSmoother(ABC):
     @property
     def preintegrates(self) -> bool:
         """Whether DVL readings are summed between keyframes."""
-        return "preintegrated-loose" in self.dvl
+        return self.dvl != {"velocity"}
 
     @property
     def period_s(self) -> float:
@@ -331,12 +343,16 @@ class GraphPass:
             return
         straight = self._config.dvl_between == "straight"
         inflate = self._rig["inflate"][0, DVL]
-        dp_ij, cov = preintegrate_dvl(
+        displacement = preintegrate_dvl(
             last.imu, last.t_ns, readings["t_ns"].copy(), readings["z"][:, :3].copy(), inflate * readings["sigma"],
             self._state.b_g, self._rig, straight,
         )  # fmt: skip
         self.counts["preintegrated"] += len(readings)
-        self._graph.add(displacement_factor(last.index, new.index, dp_ij, cov))
+        if "preintegrated-tight" in self._config.dvl:
+            factor = tight_displacement_factor(last.index, new.index, displacement, self._rig)
+        else:
+            factor = displacement_factor(last.index, new.index, displacement["dp"][0], displacement["N"][0, 3:, 3:])
+        self._graph.add(factor)
 
     # --- states between keyframes ------------------------------------------------------------------------------------
 

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from ..datasets.epochs import ATTITUDE, DEPTH, GPS, HEADING
 from ..datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
+from .dvl_preintegration import given_rotation
 from .imu import BLOCK, HELD_ACCEL, HELD_RATE, STATE, predict, process_noise, unbiased
 from .interface import Diverged
-from .measurements import measure, preintegrated_dvl_residual
+from .measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from .so3 import (
     cross,
     exp,
@@ -244,7 +245,7 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
 
 
 def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.CustomFactor:
-    """Return the preintegrated-DVL factor (eq. 6) between two keyframes."""
+    """Return the loose preintegrated-DVL factor (eq. 6) between two keyframes."""
 
     def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
@@ -254,6 +255,41 @@ def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.Custo
         return r
 
     return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], error)
+
+
+@njit(cache=True)
+def _linearise_tight_displacement(
+    displacement: NDArray[Any], K: Array, pose_i: Array, pose_j: Array, bias: Array, R_BI: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Residual, and its Jacobians by the pose of i, that of j, and the bias of i."""
+    H_i, H_j = np.empty((3, 15)), np.empty((3, 15))
+    R_i, R_j, b_g = pose_i[0:3, 0:3].copy(), pose_j[0:3, 0:3].copy(), inverse_transform(R_BI, bias[3:6])
+    p_i, p_j = pose_i[0:3, 3].copy(), pose_j[0:3, 3].copy()
+    r = tight_dvl_residual(R_i, p_i, b_g, R_j, p_j, displacement, K, H_i, H_j)
+    H_x, _, H_b = _by_gtsam(H_i, R_i, R_BI)
+    return r, H_x, _by_gtsam(H_j, R_j, R_BI)[0], H_b
+
+
+def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
+    """Return the tight preintegrated-DVL factor: the displacement given the rotation and the gyro bias of keyframe i.
+
+    Args:
+        i, j: keyframes.
+        displacement: DISPLACEMENT record from i to j.
+        rig: RIG record.
+    """
+    K, cov = given_rotation(displacement[0]["N"])
+    R_BI = rig[0]["R_BI"]
+
+    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
+        bias = values.atConstantBias(B(i)).vector()
+        r, H_i, H_j, H_b = _linearise_tight_displacement(displacement, K, pose_i, pose_j, bias, R_BI)
+        if jacobians is not None:
+            jacobians[0], jacobians[1], jacobians[2] = H_i, H_j, H_b
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], error)
 
 
 @njit(cache=True)

@@ -13,8 +13,19 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
-from ..datasets.state import POSITION, THETA, VELOCITY, Array
-from .so3 import inverse_right_jacobian, inverse_transform, log, product, skew, transform, wrap, yaw_of
+from ..datasets.state import GYRO_BIAS, POSITION, THETA, VELOCITY, Array
+from .so3 import (
+    exp,
+    inverse_right_jacobian,
+    inverse_transform,
+    log,
+    product,
+    right_jacobian,
+    skew,
+    transform,
+    wrap,
+    yaw_of,
+)
 
 
 @njit(cache=True)
@@ -99,6 +110,46 @@ def preintegrated_dvl_residual(R_i: Array, p_i: Array, p_j: Array, dp_ij: Array,
     H_i[:, POSITION] = -R_i.T
     H_j[:, POSITION] = R_i.T
     return moved - dp_ij
+
+
+@njit(cache=True)
+def tight_dvl_residual(
+    R_i: Array,
+    p_i: Array,
+    b_g: Array,
+    R_j: Array,
+    p_j: Array,
+    displacement: NDArray[Any],
+    K: Array,
+    H_i: Array,
+    H_j: Array,
+) -> Array:
+    """r(x_i, b_i, x_j) = r_p − K r_R: the displacement's residual, less what the rotation's says of it.
+
+        r_p = R_iᵀ (p_j − p_i) − Δp̃(b_g)         r_R = Log(R_iᵀ R_j ΔR̃(b_g)ᵀ)         [eq. 6, given the rotation]
+
+    Args:
+        R_i, p_i, b_g: pose and gyro bias of keyframe i.
+        R_j, p_j: pose of keyframe j.
+        displacement: DISPLACEMENT record of length 1.
+        K: (3, 3) m/rad, of `given_rotation`.
+        H_i, H_j: (3, 15), filled.
+
+    Returns:
+        r (3,) m.
+    """
+    d = displacement[0]
+    d_g = b_g - d.b_g
+    phi = transform(d.R_bg, d_g)
+    dR = product(d.dR, exp(phi))
+    r_p = preintegrated_dvl_residual(R_i, p_i, p_j, d.dp + transform(d.p_bg, d_g), H_i, H_j)
+    missed = product(product(R_i.T, R_j), dR.T)
+    r_R = log(missed)
+    K_J = product(K, inverse_right_jacobian(r_R))
+    H_j[:, THETA] = -product(K_J, dR)
+    H_i[:, THETA] += product(K_J, missed.T)
+    H_i[:, GYRO_BIAS] = product(product(K_J, dR), product(right_jacobian(phi), d.R_bg)) - d.p_bg
+    return r_p - transform(K, r_R)
 
 
 @njit(cache=True)

@@ -23,12 +23,14 @@ from fathom.datasets.scenario import (
 )
 from fathom.datasets.simulator import simulate
 from fathom.estimators import FACTORS, Diverged, Pass, create
+from fathom.estimators.dvl_preintegration import preintegrate_dvl
 from fathom.estimators.gtsam_border import (
     carried_factor,
     displacement_factor,
     insert_state,
     prior_factor,
     reading_factor,
+    tight_displacement_factor,
 )
 from fathom.estimators.imu import BLOCK, compile_rig, integrate
 from fathom.estimators.records import as_record
@@ -99,18 +101,24 @@ def test_preintegrated_dvl_navigates_about_as_well_as_velocity() -> None:
         "held": run_log(log, create("fls", dvl=["preintegrated-loose"])),
         "straight": run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between="straight")),
         "both": run_log(log, create("fls", dvl=["preintegrated-loose", "velocity"])),
+        "tight": run_log(log, create("fls", dvl=["preintegrated-tight"])),
+        "tight straight": run_log(log, create("fls", dvl=["preintegrated-tight"], dvl_between="straight")),
+        "tight both": run_log(log, create("fls", dvl=["preintegrated-tight", "velocity"])),
     }
     rmse = {name: ate(log.truth, result.online).rmse_m for name, result in results.items()}
     for name, result in results.items():
         assert result.status == "done", (name, result.cause)
         assert rmse[name] < 1.3 * rmse["velocity"] + 0.05, rmse
-    assert results["held"].counts["preintegrated"] > 250
-    assert results["both"].counts["preintegrated"] > 200
+    for name in ("held", "tight"):
+        assert results[name].counts["preintegrated"] > 250
+    for name in ("both", "tight both"):
+        assert results[name].counts["preintegrated"] > 200
 
 
-def test_with_both_dvl_factors_no_reading_is_used_twice() -> None:
+@pytest.mark.parametrize("summed", ["preintegrated-loose", "preintegrated-tight"])
+def test_with_both_dvl_factors_no_reading_is_used_twice(summed: str) -> None:
     log = simulate(replace(TACTICAL, duration_s=30.0), seed=2)
-    counts = run_log(log, create("fls", dvl=["preintegrated-loose", "velocity"], factors=["dvl"])).counts
+    counts = run_log(log, create("fls", dvl=[summed, "velocity"], factors=["dvl"])).counts
     velocities = counts["keyframes"] - 1  # one at each keyframe but the first
     assert counts["preintegrated"] + velocities <= len(log.dvl)
 
@@ -238,7 +246,9 @@ def _values(rng: np.random.Generator, R_BI: np.ndarray, n: int = 2) -> gtsam.Val
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("what", ["dvl", "depth", "gps", "heading", "attitude", "carried", "displacement", "prior"])
+@pytest.mark.parametrize(
+    "what", ["dvl", "depth", "gps", "heading", "attitude", "carried", "displacement", "tight", "prior"]
+)
 def test_factor_jacobians_are_gtsams_numerical_derivatives(what: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig = random_rig(rng)
@@ -256,6 +266,14 @@ def test_factor_jacobians_are_gtsams_numerical_derivatives(what: str, seed: int)
     elif what == "displacement":
         A = rng.normal(size=(3, 3))
         factor = displacement_factor(0, 1, rng.normal(size=3), A @ A.T + np.eye(3))
+    elif what == "tight":
+        imu, t_ns = (
+            Path(seed).imu(0.01 * np.arange(1, 91), 0.01, rig, np.zeros(3), np.zeros(3)),
+            np.arange(3) * 250_000_000,
+        )
+        b_g = 0.002 * rng.normal(size=3)
+        d = preintegrate_dvl(imu, 0, t_ns, rng.normal(size=(3, 3)), np.full((3, 3), 0.1), b_g, record, seed % 2 == 0)
+        factor = tight_displacement_factor(0, 1, d, record)
     else:
         A = rng.normal(size=(15, 15))
         factor = prior_factor(as_record(Belief(0, random_state(rng), A @ A.T + np.eye(15))), record)
@@ -336,7 +354,9 @@ def test_minutes_without_any_reading_end_where_the_filter_ends() -> None:
     assert position_gap_in_sigma(eskf.online, fls.online, 60.0).max() < 0.3
 
 
-@pytest.mark.parametrize("dvl", [["velocity"], ["preintegrated-loose"], ["preintegrated-loose", "velocity"]])
+@pytest.mark.parametrize(
+    "dvl", [["velocity"], ["preintegrated-loose"], ["preintegrated-tight"], ["preintegrated-loose", "velocity"]]
+)
 def test_readings_that_measure_nothing_are_counted_and_left_out(dvl: list[str]) -> None:
     log = simulate(Scenario(duration_s=20.0), seed=0)
     streams = {}

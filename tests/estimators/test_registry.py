@@ -29,6 +29,7 @@ def test_every_estimator_is_a_frozen_configuration_with_defaults(name: str) -> N
         ("fls", {"lag_s": -1.0}, "lag_s"),
         ("fls", {"lag_s": float("nan")}, "lag_s"),
         ("fls", {"dvl": ["preintegrated"]}, "preintegrated-loose"),
+        ("fls", {"dvl": ["preintegrated-loose", "preintegrated-tight"]}, "used twice"),
         ("eskf", {"factors": ["dvll"]}, "did you mean 'dvl'"),
         ("eskf", {"inflate": {"headin": 2.0}}, "did you mean 'heading'"),
         ("eskf", {"inflate": {"dvl": -2.0}}, "inflate"),
