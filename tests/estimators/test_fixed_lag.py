@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fathom.bench.metrics import ate, nees
 from fathom.bench.run import run_log
-from fathom.datasets import Belief, Log, Trajectory
+from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, Epoch, cut
-from fathom.datasets.log import ReadingStream
+from fathom.datasets.log import DvlStream, ImuStream, ReadingStream
 from fathom.datasets.scenario import (
     IMU_GRADES,
     DepthSpec,
@@ -121,6 +121,39 @@ def test_with_both_dvl_factors_no_reading_is_used_twice(summed: str) -> None:
     counts = run_log(log, create("fls", dvl=[summed, "velocity"], factors=["dvl"])).counts
     velocities = counts["keyframes"] - 1  # one at each keyframe but the first
     assert counts["preintegrated"] + velocities <= len(log.dvl)
+
+
+def _straight_ahead(seconds: int, v: float, noise: ImuNoise) -> Log:
+    """A log without a turn, at a velocity that the DVL knows to 0.1 mm/s, from a pose and biases that are known."""
+    imu_ns, dvl_ns = 10_000_000 * np.arange(1, 100 * seconds + 1), 200_000_000 * np.arange(1, 5 * seconds + 1)
+    f_I = np.tile([0.0, 0.0, 9.81], (len(imu_ns), 1))
+    velocities = np.tile([v, 0.0, 0.0], (len(dvl_ns), 1))
+    sigma = np.repeat([1e-6, 1e-6, 1e-3, 1e-6, 1e-9], 3)
+    state = NavState(np.eye(3), np.zeros(3), np.array([v, 0.0, 0.0]), np.zeros(3), np.zeros(3))
+    return Log(
+        "straight ahead",
+        Rig(noise, gravity=9.81),
+        ImuStream(imu_ns, np.zeros_like(f_I), f_I),
+        DvlStream(dvl_ns, dvl_ns, velocities, np.full_like(velocities, 1e-4)),
+        prior=Belief(0, state, np.diag(sigma**2)),
+    )
+
+
+@pytest.mark.parametrize("between", ["held", "straight"])
+def test_tight_counts_the_gyro_once_where_loose_takes_it_for_two(between: str) -> None:
+    """Dead reckoning over N intervals of length L, the gyro alone noisy, with variance q in each: sideways
+
+    exactly q (N L)² N/3,        with a second gyro for the displacements q Σ ((N − k)² L² + L²/3).
+    """
+    N, L, density = 8, 1.7, 1e-3
+    log = _straight_ahead(N, L, ImuNoise(density, 1.0, 1e-9, 1e-9, 1e-9, 1e-6))
+    variance = {}
+    for kind in ("loose", "tight"):
+        smoother = create("fls", lag_s=20.0, dvl=[f"preintegrated-{kind}"], dvl_between=between, factors=["dvl"])
+        variance[kind] = run_log(log, smoother).online.P[-1, 4, 4]
+    behind = (N - np.arange(1, N + 1)) * L
+    assert variance["tight"] == pytest.approx(density**2 * (N * L) ** 2 * N / 3, rel=1e-3)
+    assert variance["loose"] == pytest.approx(density**2 * (behind**2 + L**2 / 3).sum(), rel=1e-3)
 
 
 def _late(scenario: Scenario, delay_s: float) -> Scenario:
@@ -408,3 +441,29 @@ def test_preintegration_straight_is_honest_and_held_is_known_not_to_be(mode: str
         total += float(nees(log.truth, result.online, "velocity")[49])
     low, high = chi2.interval(0.999, 3 * n)
     assert (low < total < high) == honest, total / n
+
+
+@pytest.mark.slow
+def test_tight_finds_the_velocity_better_than_loose_where_the_gyro_is_worse_than_the_dvl() -> None:
+    """Keyframes 5 s apart, a gyro ten times noisier than a consumer's and a DVL five times better; by 5 % at least.
+
+    The other readings come with the keyframes only. At 1 s with real grades the two differ by less than their noise.
+    """
+    consumer = IMU_GRADES["consumer"]
+    scenario = Scenario(
+        duration_s=120.0,
+        imu=replace(consumer, gyro_density=10 * consumer.gyro_density),
+        dvl=DvlSpec(beam_sigma_mps=0.001),
+        depth=DepthSpec(rate_hz=0.2),
+        heading=HeadingSpec(rate_hz=0.2),
+    )
+    squared = {"preintegrated-loose": 0.0, "preintegrated-tight": 0.0}
+    for seed in range(10):
+        log = simulate(scenario, seed=seed)
+        for kind in squared:
+            smoother = create("fls", lag_s=20.0, dvl=[kind], dvl_between="straight", keyframe_period_s=5.0)
+            online = run_log(log, smoother).online
+            at = (online.t_ns % 5_000_000_000 == log.start_ns % 5_000_000_000) & (online.t_ns - log.start_ns > 20e9)
+            truth = log.truth.v_WB_W[np.searchsorted(log.truth.t_ns, online.t_ns[at])]
+            squared[kind] += np.square(online.v_WB_W[at] - truth).sum()
+    assert squared["preintegrated-tight"] < 0.95 * squared["preintegrated-loose"]
