@@ -77,21 +77,21 @@ LINEAR = np.r_[3:12]
 """Position, velocity and accelerometer bias: all that is uncertain in the toy."""
 
 
-def linear_toy(seed: int, epochs: int = 40) -> tuple[Belief, list[Epoch]]:
+def linear_toy(seed: int, epochs: int = 40, rig: Rig = TOY_RIG) -> tuple[Belief, list[Epoch]]:
     """A vehicle that never turns and knows its attitude: then every sensor is linear in what it does not know."""
-    rng = np.random.default_rng(seed)
+    rng, noise = np.random.default_rng(seed), rig.imu_noise
     R_WB, n, dt_s = Rotation.random(rng=rng).as_matrix(), 20, 0.01
-    p, v, b_a = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3) * 0.02
-    sigma = np.repeat([TINY, 1.0, 0.2, 0.02, TINY], 3)
+    p, v, b_a = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3) * noise.accel_bias_sigma
+    sigma = np.repeat([TINY, 1.0, 0.2, noise.accel_bias_sigma, TINY], 3)
     draw = sigma * rng.normal(size=15)
     prior = Belief(0, NavState(R_WB, p, v, b_a, np.zeros(3)).retract(np.r_[np.zeros(3), draw[3:12], np.zeros(3)]), None)
-    cut, up = [], np.array([0.0, 0.0, GRAVITY])
+    cut, up, R_IW = [], np.array([0.0, 0.0, GRAVITY]), (R_WB @ rig.imu.R_BS).T
     for k in range(epochs):
         imu = np.zeros(n, IMU_SAMPLE)
         imu["t_ns"] = np.round((np.arange(1, n + 1) + n * k) * dt_s * 1e9)
         imu["dt_s"] = imu["period_s"] = dt_s
         a_W = 0.3 * rng.normal(size=3)
-        imu["f_I"] = R_WB.T @ (a_W + up) + b_a + 2e-3 / np.sqrt(dt_s) * rng.normal(size=(n, 3))
+        imu["f_I"] = R_IW @ (a_W + up) + b_a + noise.accel_density / np.sqrt(dt_s) * rng.normal(size=(n, 3))
         T = n * dt_s
         p, v = p + v * T + 0.5 * a_W * T**2, v + a_W * T
         t_ns = int(imu["t_ns"][-1])
