@@ -4,9 +4,9 @@ GTSAM's IMU factor has three things that our block has not, so the toy is one in
 
 - each sample's position noise, INTEGRATION_DENSITY: beside 1 m/s²/√Hz of the accelerometer it is 1e-8 of the variance;
 - a bias that walks by LEAST_WALK of the white noise at least: this one walks by just that;
-- the walk's own part in the motion within a block, to (walk T / density)²/3 in the motion's variance and walk T /
-  density/2 in its correlation with the bias's step: at T = 0.2 s 1e-10 and 1e-5, of a step that is 3e-4 of what is known
-  of the bias.
+- the walk's own part in the motion within a block: (walk T / density)²/3 of the motion's variance, and a correlation
+  of √3/2 walk T / density at most with the bias's step. At T = 0.2 s they are 1e-10 and 1e-5, and the step is 1e-4 of
+  what is known of the bias.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def test_with_all_hindsight_every_smoother_is_least_squares(name: str, seed: int
 @pytest.mark.parametrize("thorough", [False, True], ids=["as shipped", "to the last digit"])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_at_a_lag_hindsight_is_least_squares_on_what_had_been_seen_by_then(seed: int, thorough: bool) -> None:
-    """A state leaves just before the keyframe comes that is the lag younger; marginalising what is older lost nothing."""
+    """A state leaves just before the keyframe comes that is the lag younger; marginalising the older lost nothing."""
     _, hindsight = run("fls", seed, thorough)
     n = len(hindsight)
     assert apart(hindsight, [exact(seed, min(k + LAG, n))[k] for k in range(n)]) < 1e-6
