@@ -6,11 +6,13 @@ moves that state, and the error is zero again.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
+from scipy.linalg import LinAlgWarning
 
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, Array, Belief
@@ -54,7 +56,9 @@ class FilterpyKalman:
         r, H, C = stack(state, rig, readings)
         if len(r):
             try:
-                ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", LinAlgWarning)  # of an ill-conditioned S we judge ourselves
+                    ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
                 np.linalg.cholesky(ekf.S)
             except (np.linalg.LinAlgError, ValueError):  # scipy's way of saying that something is not finite
                 return False

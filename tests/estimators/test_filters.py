@@ -11,7 +11,6 @@ from fathom.bench.pose_error import heading_roll_pitch, wrapped
 from fathom.bench.run import Result, run_log
 from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig
 from fathom.datasets.epochs import DEPTH, DVL, GPS, IMU_SAMPLE, Epoch
-from fathom.datasets.log import ImuStream
 from fathom.datasets.scenario import DvlSpec, GpsSpec, Scenario
 from fathom.datasets.simulator import simulate
 from fathom.estimators import create
@@ -316,45 +315,3 @@ def test_late_readings_are_lived_through_again(name: str) -> None:
 def _until(stream: object, t_ns: int) -> object:
     rows = stream.t_ns <= t_ns
     return type(stream)(stream.t_ns[rows], stream.received_ns[rows], stream.z[rows], stream.sigma[rows])
-
-
-# -- bad input --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("absent", [["dvl"], ["gps"], ["heading"], ["dvl", "gps", "depth", "heading"]])
-def test_without_a_sensor_it_runs_on_and_says_how_little_it_knows(name: str, absent: list[str]) -> None:
-    log = simulate(Scenario(duration_s=30.0), seed=6)
-    full = run_log(log, create(name))
-    bare = run_log(replace(log, **dict.fromkeys(absent)), create(name))
-    assert bare.status == "done"
-    assert len(bare.online) == 30
-    assert np.trace(bare.online.P[-1]) > np.trace(full.online.P[-1])
-
-
-@pytest.mark.parametrize("name", FILTERS)
-def test_a_long_gap_ends_the_run_and_a_short_one_is_bridged(name: str) -> None:
-    log = simulate(Scenario(duration_s=30.0), seed=6)
-    seconds = (log.imu.t_ns - log.start_ns) * 1e-9
-    for end_s, status in ((15.5, "done"), (18.0, "failed")):
-        keep = (seconds < 15.0) | (seconds > end_s)
-        imu = ImuStream(log.imu.t_ns[keep], log.imu.w_WI_I[keep], log.imu.f_I[keep])
-        result = run_log(replace(log, imu=imu), create(name))
-        assert result.status == status
-        assert (result.cause or "imu gap").startswith("imu gap")
-        if name == "rts":  # with hindsight up to the gap
-            assert np.array_equal(result.smoothed.t_ns, result.online.t_ns)
-
-
-@pytest.mark.parametrize("name", FILTERS)
-@pytest.mark.parametrize("harm", ["nan state", "nan covariance", "negative covariance"])
-def test_a_lost_estimate_is_called_diverged(name: str, harm: str) -> None:
-    log = simulate(Scenario(duration_s=20.0), seed=6)
-    x, P = log.prior.state, log.prior.P
-    prior = {
-        "nan state": Belief(log.start_ns, replace(x, v_WB_W=np.full(3, np.nan)), P),
-        "nan covariance": Belief(log.start_ns, x, np.full((15, 15), np.nan)),
-        "negative covariance": Belief(log.start_ns, x, -P),
-    }[harm]
-    result = run_log(log.with_prior(prior), create(name))
-    assert result.status == "diverged", result.cause

@@ -202,13 +202,6 @@ def test_a_silent_dvl_leaves_keyframes_to_the_others() -> None:
     assert 36 <= result.counts["keyframes"] <= 43
 
 
-def test_imu_alone_runs() -> None:
-    log = replace(simulate(Scenario(duration_s=20.0), seed=3), dvl=None, depth=None, gps=None, heading=None)
-    result = run_log(log, create("fls"))
-    assert result.status == "done"
-    assert len(result.smoothed) == len(result.online)
-
-
 def test_factor_slots_stay_bounded() -> None:
     log = simulate(replace(TACTICAL, duration_s=100.0), seed=1)
     run = create("fls", lag_s=3.0).begin(log.prior, log.rig)
