@@ -155,9 +155,10 @@ def _experiments() -> dict[str, str]:
 
 
 def _scores() -> dict[str, str]:
+    from .floor_ratio import FLOORS
     from .run import COSTS, INNOVATIONS, SCORES
 
-    return SCORES | INNOVATIONS | COSTS
+    return SCORES | FLOORS | INNOVATIONS | COSTS
 
 
 _LISTS = {

@@ -5,41 +5,25 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from itertools import cycle
 from pathlib import Path
 from textwrap import fill
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullLocator
 
 from ..datasets.state import Array
 from ..datasets.trajectory import Trajectory
 from .consistency import FALSE_ALARM, anees_of
+from .drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
+from .lag_figure import draw_lag_curve, lag_curve
 from .metrics import BLOCKS, Alignment, ScoreError, align, associate
 from .summary import Record, groups, is_judged, records, summarise
 
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#B8A000")
-"""Okabe & Ito's colours, which readers with any colour vision tell apart; black is the truth's."""
-
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
-DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 AXES = ("east", "north", "up")
-WIDTH_IN = 7.2
-
-
-class Look(NamedTuple):
-    """How one estimator is drawn in every figure."""
-
-    colour: str
-    marker: str
-    dash: str | tuple[int, tuple[float, ...]]
 
 
 class Track(NamedTuple):
@@ -67,6 +51,9 @@ def draw_figures(rows: pd.DataFrame, folder: Path) -> list[Path]:
         stem = folder / "figures" / re.sub(r"[^\w.=+-]+", "_", log)
         if log in judged and any(row["nees_at"] for row in of_log):
             files += save(draw_anees(of_log, looks, log), Path(f"{stem}-anees"))
+        of_summary = [record for record in summary if record["log"] == log]
+        if lag_curve(of_summary) is not None:
+            files += save(draw_lag_curve(of_summary, looks, log), Path(f"{stem}-lag"))
         tracks, seed = tracks_of(of_log, folder / "trajectories")
         if not tracks:
             continue
@@ -78,16 +65,6 @@ def draw_figures(rows: pd.DataFrame, folder: Path) -> list[Path]:
     if priced:
         files += save(draw_costs(priced, looks), folder / "figures" / "accuracy-cost")
     return files
-
-
-def looks_of(labels: Sequence[str]) -> dict[str, Look]:
-    """Give each label a look; no two share colour and marker until there are 64."""
-    markers = [m for shift in range(len(MARKERS)) for m in MARKERS[shift:] + MARKERS[:shift]]
-    dashes = [dash for dash in DASHES for _ in PALETTE]
-    return {
-        label: Look(*look)
-        for label, look in zip(labels, zip(cycle(PALETTE), cycle(markers), cycle(dashes)), strict=False)
-    }
 
 
 def tracks_of(rows: Sequence[Record], folder: Path) -> tuple[list[Track], int | None]:
@@ -122,7 +99,7 @@ def load_trajectory(path: Path) -> Trajectory:
 
 def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> Figure:
     """Draw the tracks from above, equal axes; hindsight thin."""
-    figure, (axes,) = _figure(1, 1, WIDTH_IN, 4.6)
+    figure, (axes,) = empty_figure(1, 1, WIDTH_IN, 4.6)
     truth = next((track.truth for track in tracks if track.truth is not None), None)
     if truth is not None:
         axes.plot(*truth.p_WB_W[:, :2].T, color="black", linewidth=2.4, alpha=0.35, label="truth")
@@ -155,7 +132,7 @@ def draw_errors(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
     tracks = [track for track in tracks if track.truth is not None]
     labels = list(dict.fromkeys(track.label for track in tracks))
     known = [axis for axis in range(3) if any(np.isfinite(_error(track)[:, axis]).any() for track in tracks)]
-    figure, panels = _figure(len(labels), len(known), WIDTH_IN, 0.9 + 1.15 * len(labels))
+    figure, panels = empty_figure(len(labels), len(known), WIDTH_IN, 0.9 + 1.15 * len(labels))
     grid = np.reshape(np.array(panels, dtype=object), (len(labels), len(known)))
     for track in tracks:
         for axes, axis in zip(grid[labels.index(track.label)], known, strict=True):
@@ -197,7 +174,7 @@ def draw_anees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fi
 
     The band is that of the most seeds that any estimator has; hindsight is open and dotted.
     """
-    figure, panels = _figure(len(BLOCKS), 1, WIDTH_IN, 1.2 + 1.5 * len(BLOCKS))
+    figure, panels = empty_figure(len(BLOCKS), 1, WIDTH_IN, 1.2 + 1.5 * len(BLOCKS))
     done = [row for row in rows if row["status"] == "done"]
     lines = {key: anees_of([row["nees_at"] for row in of]) for key, of in groups(done, "label", "output").items()}
     for block, axes in zip(BLOCKS, panels, strict=True):
@@ -217,15 +194,15 @@ def draw_anees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fi
             widest = max(averages.values(), key=lambda average: (average.runs.max(), len(average)))
             axes.axhspan(widest.low.min(), widest.high.max(), color="black", alpha=0.12, linewidth=0)
         axes.axhline(1, color="black", linewidth=0.4)
-        _logarithmic(axes, "y")
+        logarithmic(axes, "y")
         axes.set_ylabel(block)
     panels[-1].set_xlabel("time, s")
     runs = max((int(average.runs.max()) for of_line in lines.values() for average in of_line.values()), default=0)
     figure.suptitle(f"{title}: NEES by degree of freedom, mean of {runs} seeds", fontsize=10)
     drawn = dict.fromkeys(label for (label, _), of_line in lines.items() if of_line)
-    handles = [_handle(label, looks[label].marker, looks[label].colour, True) for label in drawn]
+    handles = [handle(label, looks[label].marker, looks[label].colour, True) for label in drawn]
     if any(output == "hindsight" for _, output in lines):
-        handles.append(_handle("with hindsight", "o", "black", False))
+        handles.append(handle("with hindsight", "o", "black", False))
     band = f"{1 - FALSE_ALARM:.1%} of honest lines stay in here"
     handles.append(Line2D([], [], color="black", alpha=0.12, linewidth=6, label=band))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
@@ -237,7 +214,7 @@ def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
     logs = groups(summary, "log")
     columns = min(2, len(logs))
     lines = math.ceil(len(logs) / columns)
-    figure, panels = _figure(lines, columns, WIDTH_IN, 1.1 + 2.4 * lines, share_x=False)
+    figure, panels = empty_figure(lines, columns, WIDTH_IN, 1.1 + 2.4 * lines, share_x=False)
     for axes in panels[len(logs) :]:
         axes.remove()
     for axes, ((log,), of_log) in zip(panels, logs.items(), strict=False):
@@ -255,46 +232,12 @@ def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
         axes.set_xlabel("computing, ms per second of voyage")
         axes.set_ylabel("ATE, m")
         axes.margins(0.12)
-        _logarithmic(axes, "xy")
-    handles = [_handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(summary, "label")]
+        logarithmic(axes, "xy")
+    handles = [handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(summary, "label")]
     if any(row["output"] == "hindsight" for row in summary):
-        handles.append(_handle("with hindsight", "o", "black", False))
+        handles.append(handle("with hindsight", "o", "black", False))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
-
-
-def _logarithmic(axes: Axes, which: str) -> None:
-    """Make the axes "x", "y" or both logarithmic, with plain numbers at 1, 2 and 5, over at least a factor of four."""
-    for name in which:
-        axis = axes.xaxis if name == "x" else axes.yaxis
-        axes.set(**{f"{name}scale": "log"})
-        low, high = axis.get_view_interval()
-        middle = math.sqrt(low * high)
-        axis.set_view_interval(min(low, middle / 2), max(high, middle * 2), ignore=True)
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 1e3 else (1.0,)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_locator(NullLocator())
-
-
-def _handle(label: str, marker: str, colour: str, filled: bool) -> Line2D:
-    face = colour if filled else "white"
-    return Line2D([], [], marker=marker, color=colour, markerfacecolor=face, linestyle="none", label=label)
-
-
-def _figure(
-    lines: int, columns: int, width_in: float, height_in: float, share_x: bool = True
-) -> tuple[Figure, list[Axes]]:
-    """Return a figure that needs no display, and its axes row by row."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    with rc_context({"axes.labelsize": 8, "axes.titlesize": 9}):
-        grid = figure.subplots(lines, columns, squeeze=False, sharex=share_x)
-    panels: list[Axes] = list(grid.ravel())
-    for axes in panels:
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.25, linewidth=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure, panels
 
 
 def _error(track: Track) -> Array:
@@ -316,12 +259,3 @@ def _has_band(track: Track) -> bool:
 def _aligned(tracks: Sequence[Track]) -> str:
     modes = {track.align for track in tracks} - {"none"}
     return f" (aligned: {', '.join(sorted(modes))})" if modes else ""
-
-
-def save(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as PDF and PNG and return the files."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    files = [Path(f"{stem}.pdf"), Path(f"{stem}.png")]
-    for file in files:
-        figure.savefig(file, dpi=160, metadata={"CreationDate": None} if file.suffix == ".pdf" else {})
-    return files

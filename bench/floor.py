@@ -45,10 +45,9 @@ from ..datasets.scenario import Scenario
 from ..datasets.simulator import simulate
 from ..datasets.state import DIM, LIMIT_NS, VELOCITY, Array, TimeArray
 from ..datasets.trajectory import Trajectory
-from ..estimators.eskf import decorrelate
 from ..estimators.imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise
 from ..estimators.interface import FACTORS
-from ..estimators.measurements import measure
+from ..estimators.measurements import decorrelate, measure
 from .association import ScoreError
 from .pose_error import rotation_vector
 

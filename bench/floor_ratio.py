@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from ..datasets.state import Array
+from ..datasets.state import POSITION, THETA, VELOCITY, Array, TimeArray
 from ..datasets.trajectory import Trajectory
 from .association import ScoreError, associate
 from .floor import Floor
 from .pose_error import check_finite
 from .state_error import error_state
+
+FLOORS = {
+    "floor_position_m": "floor (posterior Cramér–Rao bound) of the position error's root mean square, m",
+    "floor_attitude_deg": "floor of the rotation angle's, °",
+    "floor_velocity_m_s": "floor of the velocity error's, m/s",
+}
+"""Only of simulated logs, and where `floor` is asked for."""
+
+OVER = {
+    "position": ("ate_rmse_m", "floor_position_m"),
+    "attitude": ("rotation_rmse_deg", "floor_attitude_deg"),
+    "velocity": ("velocity_rmse_m_s", "floor_velocity_m_s"),
+}
+"""Which score stands over which floor, by block."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,16 @@ def squares(truth: Trajectory, estimate: Trajectory, floor: Floor, block: slice)
         raise ScoreError("floor: the error of this block is not known")
     variances = floor.P[floor_rows].diagonal(axis1=1, axis2=2)[:, block]
     return float((e * e).sum(axis=1).mean()), float(variances.sum(axis=1).mean())
+
+
+def floor_scores(floor: Floor, t_ns: TimeArray) -> dict[str, float | None]:
+    """Return every score of FLOORS by name, over the poses at t_ns; None where the floor does not have them all."""
+    rows = np.isin(floor.t_ns, t_ns)
+    if rows.sum() < len(t_ns):
+        return dict.fromkeys(FLOORS)
+    variances = floor.P[rows].diagonal(axis1=1, axis2=2)
+    p, theta, v = (math.sqrt(variances[:, block].sum(axis=1).mean()) for block in (POSITION, THETA, VELOCITY))
+    return dict(zip(FLOORS, (p, math.degrees(theta), v), strict=True))
 
 
 def rmse_over_floor(

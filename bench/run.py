@@ -422,6 +422,7 @@ class Scoring:
         score_period_s: beliefs are asked for this far apart; 1 ms or more.
         nees_epochs: at how many times, evenly spaced over the log, NEES is averaged over the seeds (see `consistency`).
         nis: judge the estimators by their innovations, see `run_log`; their costs are then not to be compared.
+        floor: find the posterior Cramér–Rao bound of every output, of simulated logs.
     """
 
     align: Alignment = "none"
@@ -433,6 +434,7 @@ class Scoring:
     score_period_s: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
     nees_epochs: Annotated[int, Field(ge=1, le=1000)] = 10
     nis: bool = False
+    floor: bool = False
 
     @model_validator(mode="after")
     def _step_is_possible(self) -> Scoring:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import signal
@@ -26,10 +27,13 @@ import pandas as pd
 
 from ..datasets.log import Log
 from ..datasets.opening import RecordingNotFound
+from ..datasets.scenario import Scenario
 from ..datasets.trajectory import Trajectory
 from ..estimators.interface import Estimator
 from .consistency import nees_at
 from .experiment import Experiment, ExperimentError, Run, plain
+from .floor import Floor, floors
+from .floor_ratio import FLOORS, floor_scores
 from .run import Result, can_judge, costs, innovation_dof, innovation_scores, run_log, scores, warm_up
 from .store import Row, Store, provenance
 
@@ -329,6 +333,7 @@ class Bench:
 
     def __init__(self) -> None:
         self.logs: OrderedDict[str, Log] = OrderedDict()
+        self.floors: dict[str, dict[float, Floor]] = {}
         self.warm: set[str] = set()
 
     def execute(self, task: Task) -> list[Row]:
@@ -353,12 +358,13 @@ class Bench:
 
     def open(self, task: Task) -> Log:
         """Open or simulate the task's log, unless it is one of the last."""
-        key = json.dumps([plain(task.run.log), task.run.seed])
+        key = log_key(task)
         if key not in self.logs:
             self.logs[key] = task.run.log.open(task.run.seed, task.data, task.repair)
         self.logs.move_to_end(key)
         while len(self.logs) > LOGS_KEPT:
-            self.logs.popitem(last=False)
+            gone, _ = self.logs.popitem(last=False)
+            self.floors = {of: floors for of, floors in self.floors.items() if not of.startswith(gone)}
         return self.logs[key]
 
     def estimator(self, task: Task) -> Estimator:
@@ -368,6 +374,26 @@ class Bench:
             warm_up(estimator)
             self.warm.add(repr(estimator))
         return estimator
+
+    def floor(self, task: Task, result: Result, lookahead_s: float) -> dict[str, float | None]:
+        """Return the scores of FLOORS for one look-ahead; None where there are none: of a recorded log, say.
+
+        The floors of all the experiment's lags are found together, once for all estimators that use the same sensors.
+        """
+        experiment, run = task.experiment, task.run
+        scoring = experiment.scoring(run.log)
+        asked = scoring.floor and run.log.scenario is not None and (scoring.align, scoring.dims) == ("none", "3d")
+        if not asked or result.status != "done" or result.online is None:
+            return dict.fromkeys(FLOORS)
+        assert run.seed is not None
+        factors = run.estimator.create().factors
+        key = f"{log_key(task)} {sorted(factors)}"
+        if lookahead_s not in self.floors.get(key, {}):
+            lags = {getattr(estimator.create(), "lag_s", 0.0) for estimator in experiment.estimators}
+            scenario = Scenario.from_dict(run.log.scenario or {})
+            wanted = sorted({0.0, math.inf, lookahead_s, *lags})
+            self.floors[key] = floors(scenario, run.seed, result.online.t_ns, wanted, factors, experiment.max_gap_s)
+        return floor_scores(self.floors[key][lookahead_s], result.online.t_ns)
 
     def rows(self, task: Task, log: Log, result: Result, extra: Row) -> list[Row]:
         """Score a run and save its trajectories: one row per output."""
@@ -390,10 +416,16 @@ class Bench:
             row = task.row(result.status, result.cause, output) | shared | scores(log, trajectory, scoring)
             if output == "online":
                 row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
+            row |= self.floor(task, result, trajectory.lookahead_s)
             if can_judge(log, scoring):
                 row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
             rows.append(row | {"lookahead_s": trajectory.lookahead_s, "trajectory": name})
         return rows or [task.row(result.status, result.cause) | shared]
+
+
+def log_key(task: Task) -> str:
+    """Return what tells the task's log from any other."""
+    return json.dumps([plain(task.run.log), task.run.seed])
 
 
 def save(task: Task, output: str, trajectory: Trajectory) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 import pandas as pd
 
 from .experiment import ExperimentError
+from .floor_ratio import FLOORS
 from .run import COSTS, INNOVATIONS, SCORES
 
 Row = Mapping[str, Any]
@@ -51,7 +52,7 @@ ORIGIN = {
     "versions": "TEXT",  # JSON
     "machine": "TEXT",  # JSON
 }
-COLUMNS = IDENTITY | OUTCOME | dict.fromkeys([*SCORES, *INNOVATIONS, *COSTS], "REAL") | HONESTY | ORIGIN
+COLUMNS = IDENTITY | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | ORIGIN
 RENAMED = {"anees_position": "nees_position"}
 """Columns that an older version called otherwise."""
 SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"

@@ -7,16 +7,26 @@ from collections.abc import Callable, Iterable, Sequence
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
+import numpy as np
 import pandas as pd
 
 from .consistency import anees_of, pooled_nis
+from .floor_ratio import FLOORS, OVER, rmse_over_floor
 from .metrics import BLOCKS, pooled_rmse
 from .run import INNOVATIONS, SCORES
 
 Record: TypeAlias = dict[str, Any]
 """One row, absent values being None."""
 
-POOLED = {"ate_rmse_m": "n_scored", "heading_rmse_deg": "n_scored", "rpe_rmse_m": "n_rpe", "drms_m": "n_scored"}
+POOLED = {
+    "ate_rmse_m": "n_scored",
+    "rotation_rmse_deg": "n_scored",
+    "heading_rmse_deg": "n_scored",
+    "velocity_rmse_m_s": "n_scored",
+    "rpe_rmse_m": "n_rpe",
+    "drms_m": "n_scored",
+    **dict.fromkeys(FLOORS, "n_scored"),
+}
 """Root mean squares are pooled over seeds before the root, each with its own count."""
 
 MEAN = (
@@ -80,6 +90,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= {name: _pooled(done, name, count) for name, count in POOLED.items()}
         record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
         record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
+        record |= _over_floor(done)
         record |= _honesty(done)
         record |= {name: _counted(done, of) for name, of in COUNTS.items()}
         record |= {name: _counted(done, [name]) for name in _outliers(every)}
@@ -101,6 +112,19 @@ def _pooled(done: Sequence[Record], name: str, count: str) -> float | None:
 def _over_seeds(statistic: Callable[[list[float]], float], done: Sequence[Record], name: str) -> float | None:
     known = [row[name] for row in done if row[name] is not None]
     return statistic(known) if known else None
+
+
+def _over_floor(done: Sequence[Record]) -> Record:
+    """Return each RMSE over its floor, with its 95 % interval over seeds."""
+    record: Record = {}
+    for block, (score, floor) in OVER.items():
+        known = [row for row in done if row[score] is not None and row[floor] is not None]
+        of = [np.array([row[name] ** 2 for row in known]) for name in (score, floor)]
+        ratio = rmse_over_floor(*of) if known else None
+        for part in ("ratio", "low", "high"):
+            name = f"over_floor_{block}" if part == "ratio" else f"over_floor_{block}_{part}"
+            record[name] = None if ratio is None else getattr(ratio, part)
+    return record
 
 
 def _honesty(done: Sequence[Record]) -> Record:

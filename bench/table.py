@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from .floor_ratio import OVER
 from .metrics import BLOCKS
 from .run import INNOVATIONS
 from .summary import CONSISTENCY, OUTLIERS, Record, consistency, groups, is_judged, records, summarise
@@ -47,15 +48,15 @@ def write_consistency(rows: pd.DataFrame, path: Path) -> None:
 def print_table(rows: pd.DataFrame, console: Console | None = None) -> None:
     """Print the tables of each log, then what did not come to its end, and whose readings were mostly of no use.
 
-    Accuracy and cost for every log; honesty where NIS was asked for, or seeds are enough for ANEES; late readings and
-    outliers where there were any.
+    Accuracy and cost for every log; the floor where it was asked for; honesty where NIS was asked for, or seeds are
+    enough for ANEES; late readings and outliers where there were any.
     """
     if console is None:
         console = Console()
         if not console.is_terminal:
             console = Console(width=120)
     for summary in groups(summarise(rows), "log").values():
-        for table in (_accuracy(summary), _honesty(summary), _late_or_out(summary)):
+        for table in (_accuracy(summary), _floor(summary), _honesty(summary), _late_or_out(summary)):
             if table is not None:
                 console.print(table)
                 console.print()
@@ -104,6 +105,26 @@ def _accuracy(summary: Sequence[Record]) -> Table:
             numbers = (_cell(name, row[name]) for name in SHOWN)
             table.add_row(Text("" if k else label), _lookahead(row), f"{row['done']}/{row['runs']}", *numbers)
     return table
+
+
+def _floor(summary: Sequence[Record]) -> Table | None:
+    """RMSE over the posterior Cramér–Rao bound; None where that is not known."""
+    if not any(row[floor] is not None for row in summary for _, floor in OVER.values()):
+        return None
+    caption = "RMSE over the posterior Cramér–Rao bound of the same look-ahead; its 95 % bootstrap interval over seeds"
+    table = _empty(f"{summary[0]['log']}: over the floor", caption, ("sees\nahead", "runs", *OVER))
+    for (label,), of_label in groups(summary, "label").items():
+        for k, row in enumerate(of_label):
+            ratios = (_ratio(row, block) for block in OVER)
+            table.add_row(Text("" if k else label), _lookahead(row), f"{row['done']}", *ratios)
+    return table
+
+
+def _ratio(row: Record, block: str) -> str:
+    ratio, low, high = (row[f"over_floor_{block}{part}"] for part in ("", "_low", "_high"))
+    if ratio is None:
+        return ABSENT
+    return f"{ratio:.3f}" if low is None else f"{ratio:.3f} [{low:.3f}, {high:.3f}]"
 
 
 def _honesty(summary: Sequence[Record]) -> Table | None:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fathom.bench.experiment import Experiment
+from fathom.bench.drawing import looks_of
 from fathom.bench.figures import (
     draw_anees,
     draw_costs,
@@ -16,7 +17,6 @@ from fathom.bench.figures import (
     draw_figures,
     draw_tracks,
     load_trajectory,
-    looks_of,
     tracks_of,
 )
 from fathom.bench.runner import Bench, Task
