@@ -8,8 +8,8 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
-from fathom.bench.experiment import Experiment
 from fathom.bench.drawing import looks_of
+from fathom.bench.experiment import Experiment
 from fathom.bench.figures import (
     draw_anees,
     draw_costs,
