@@ -337,8 +337,8 @@ def test_squares_are_those_of_the_block_at_common_times() -> None:
         zero,
         lookahead_s=3.0,
     )
-    P = np.arange(1.0, 5.0)[:, None, None] * np.diag(np.arange(15.0))
-    floor = Floor(np.arange(1, 5) * SECOND, P, 3.0)
+    P = np.array([100.0, 1.0, 2.0, 3.0, 4.0])[:, None, None] * np.diag(np.arange(15.0))
+    floor = Floor(np.array([-1, 1, 2, 3, 4]) * SECOND, P, 3.0)
     for block, error, bound in (
         (THETA, 0.0025, 3.0),
         (POSITION, 9.0, 12.0),
