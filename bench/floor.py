@@ -39,7 +39,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..datasets.epochs import READING, Epoch, cut
+from ..datasets.epochs import IMU_SAMPLE, READING, Epoch, cut
 from ..datasets.log import Log
 from ..datasets.scenario import Scenario
 from ..datasets.simulator import simulate
@@ -195,7 +195,7 @@ def motions(epochs: list[Epoch], x: NDArray[Any], rig: NDArray[Any]) -> tuple[Ar
     """Return F and Q (n, 15, 15) of the blocks that lead to each of the true states x; also settles rig's rate_cov."""
     F, Q = np.zeros((len(x), DIM, DIM)), np.zeros((len(x), DIM, DIM))
     block, end = np.zeros(1, BLOCK), np.zeros(1, STATE)
-    before = first_sample(epochs[0].imu, rig) if epochs else None
+    before = first_sample(epochs[0].imu if epochs else np.zeros(0, IMU_SAMPLE), rig)
     for j, epoch in enumerate(epochs, 1):
         state = x[j - 1 : j]
         integrate(epoch.imu, before, state["b_a"][0], state["b_g"][0], rig, block)
