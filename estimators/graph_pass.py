@@ -69,9 +69,10 @@ class GraphSmoother(ABC):
             displacement from keyframe to keyframe (eq. 6), turned by the gyro at the bias of the moment, as if the IMU
             factor had another gyro. "preintegrated-tight": the same displacement given the rotation between the
             keyframes and the gyro bias, so that with the IMU factor each gyro sample counts once. One of these two
-            at most. With "velocity" beside it, the reading at a keyframe goes by its velocity and the others are
-            summed, so that none is used twice. A reading that comes after its interval was closed goes by its velocity
-            whatever is said here.
+            at most: over a second they differ little; over 5 s with a consumer's gyro, loose claims to know the
+            attitude too well. With "velocity" beside it, the reading at a keyframe goes by its velocity and the others
+            are summed, so that none is used twice. A reading that comes after its interval was closed goes by its
+            velocity whatever is said here.
         dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
             straight, up to the reading at the interval's end (which so has a small part in two factors). Held, its
             covariance knows the DVL's and the gyro's noise but not what is lost by holding: on a vehicle that
