@@ -410,23 +410,31 @@ def test_a_belief_under_which_no_reading_is_possible_is_counted(log: Log) -> Non
     assert set(innovation_scores(result).values()) == {None}
 
 
-def test_a_step_in_halves_is_timed_as_one_and_the_belief_between_is_not_charged(log: Log) -> None:
-    class Slow(FakePass):
-        def belief(self) -> Belief:
-            time.sleep(0.004)
-            return super().belief()
+def test_a_step_in_halves_is_timed_as_one_and_the_belief_between_is_not_charged(
+    log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that only steps (1 µs) and beliefs (1 ms) move on."""
+    now_ns = 0
 
-    class SlowFake(Fake):
-        def begin(self, prior: Belief, rig: Rig) -> FakePass:
-            return Slow(self, prior)
+    def spend(ns: int) -> None:
+        nonlocal now_ns
+        now_ns += ns
+
+    monkeypatch.setattr("fathom.bench.run.perf_counter_ns", lambda: now_ns)
+    honest = truthful(log)
+
+    def answer(t_ns: int) -> tuple[NavState, np.ndarray]:
+        spend(1_000_000)
+        return honest(t_ns)
 
     seen: list[Epoch] = []
-    whole = run_log(log, Fake(truthful(log), seen=seen))
     halves: list[Epoch] = []
-    result = run_log(log, SlowFake(truthful(log), lambda k: time.sleep(0.001), seen=halves), nis=True)
-    assert len(result.step_ns) == len(whole.step_ns) == len(seen) < len(halves)
+    whole = run_log(log, Fake(answer, lambda k: spend(1000), seen=seen))
+    result = run_log(log, Fake(answer, lambda k: spend(1000), seen=halves), nis=True)
+    assert whole.step_ns.tolist() == [1000] * len(seen)
+    assert result.step_ns.tolist() == [2000 if len(epoch.readings) else 1000 for epoch in seen]
+    assert result.belief_ns.tolist() == whole.belief_ns.tolist() == [1_000_000] * 30
     assert (result.duration_s, result.imu_samples) == (whole.duration_s, whole.imu_samples)
-    assert 2.0e6 < np.median(result.step_ns) < 3.9e6  # two sleeps of a step, and none of a belief
     assert np.array_equal(np.concatenate([e.imu for e in halves]), np.concatenate([e.imu for e in seen]))
     assert np.array_equal(np.concatenate([e.readings for e in halves]), np.concatenate([e.readings for e in seen]))
     assert not [e for e in halves if len(e.imu) and len(e.readings)]
