@@ -218,6 +218,8 @@ def run_log(
         nis: judge the estimator by its innovations. It then gets each epoch in two halves, first the motion without
             readings, then the readings without motion, and is asked for its belief in between. A step's time is that of
             both halves; the belief is not charged, but what it leaves computed may make a smoother's next step cheaper.
+            What is said stays the same, but for a graph smoother with late readings: asked for a belief, it takes their
+            factors in at once and not with its next keyframe.
 
     Raises:
         DatasetError: no prior can be made for the log.

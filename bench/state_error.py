@@ -81,7 +81,7 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
     known = ~(np.isnan(e).any(axis=1) | np.isnan(P).any(axis=(1, 2)))
     score = np.full(len(e), np.nan)
     try:
-        L = np.linalg.cholesky(P[known])
+        L = np.linalg.cholesky(P[known]).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
         row = int(np.flatnonzero(known)[np.argmin(np.linalg.eigvalsh(P[known])[:, 0])])
         raise ScoreError(f"nees: P of {block!r} is not positive definite at {t_ns[row]} ns") from None
