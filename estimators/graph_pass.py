@@ -45,6 +45,7 @@ DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
 LONGEST_SILENCE_S = 1.0
 """A first-order bias correction, and one factor's rounding, hold for about so long without a keyframe."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 def _once(dvl: frozenset[DvlFactor]) -> frozenset[DvlFactor]:
@@ -83,9 +84,7 @@ class GraphSmoother(ABC):
         merge_ns: a reading this close to a keyframe is taken as of it, and counted.
         factors: the sensors it may use.
         inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
-        factorization: iSAM2's; Cholesky fails on the IMU noise of a tactical grade.
-        relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
-            linearises a variable anew. Position enters every factor linearly but for its rotation into B.
+        factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
         hindsight_covariance_s: period at which states with hindsight keep their covariance.
     """
 
@@ -98,7 +97,6 @@ class GraphSmoother(ABC):
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     factorization: Literal["QR", "CHOLESKY"] = "QR"
-    relinearize: tuple[Positive, Positive, Positive, Positive] = (0.005, 10.0, 0.05, 1.0)
     hindsight_covariance_s: Positive = 5.0
 
     @property

@@ -14,7 +14,7 @@ from .eskf_filterpy import FilterpyKalmanFilter
 from .iekf import InvariantKalmanFilter
 from .interface import Estimator
 from .rts import RauchTungStriebelSmoother
-from .smoothers import BatchSmoother, FixedLagSmoother, WholeLogSmoother
+from .smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother
 from .ukf import UnscentedKalmanFilter
 
 ESTIMATORS: dict[str, Any] = {
@@ -25,6 +25,7 @@ ESTIMATORS: dict[str, Any] = {
     "ukf": UnscentedKalmanFilter,
     "rts": RauchTungStriebelSmoother,
     "fls": FixedLagSmoother,
+    "fls-batch": BatchFixedLagSmoother,
     "isam2": WholeLogSmoother,
     "batch": BatchSmoother,
 }

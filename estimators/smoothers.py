@@ -1,25 +1,51 @@
-"""The smoothers on GTSAM: a fixed lag, the whole log incrementally, and the whole log at once."""
+"""The smoothers on GTSAM: a fixed lag and the whole log, each incrementally and by batches."""
 
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
+import gtsam
+from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from ..datasets.state import Array
-from .graph_pass import GraphSmoother, Positive
-from .solvers import BatchSolver, IncrementalSolver, Solver, isam2_params
+from .graph_pass import GraphSmoother, NonNegative, Positive
+from .solvers import BatchLagSolver, BatchSolver, IncrementalSolver, Solver, isam2_params
 
 
 @dataclass(frozen=True)
-class FixedLagSmoother(GraphSmoother):
+class IncrementalSmoother(GraphSmoother):
+    """What the smoothers on iSAM2 can be told besides: how near the optimum they stay, and at what cost.
+
+    With relinearize and wildfire all 0 and two extra updates every step ends at the optimum of what is in the graph,
+    for a cost that grows with the length of the window.
+
+    Attributes:
+        relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
+            linearises a variable anew. Position enters every factor linearly but for its rotation into B.
+        wildfire: an update goes down the tree as far as variables move by more than this (in their own units).
+        extra_updates: Gauss–Newton steps after the one that takes in new factors.
+    """
+
+    relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)
+    wildfire: NonNegative = 1e-3
+    extra_updates: Annotated[int, Field(ge=0)] = 0
+
+    def isam2_params(self) -> gtsam.ISAM2Params:
+        """Return iSAM2's parameters."""
+        return isam2_params(self.factorization, self.relinearize, self.wildfire)
+
+
+@dataclass(frozen=True)
+class FixedLagSmoother(IncrementalSmoother):
     """MAP over the last lag_s seconds; older states are marginalised out (GTSAM's IncrementalFixedLagSmoother).
 
     Attributes:
-        lag_s: length of the window.
+        lag_s: length of the window; 0 keeps the newest keyframe alone, and is a filter.
     """
 
-    lag_s: Positive = 3.0
+    lag_s: NonNegative = 3.0
 
     @property
     def window_s(self) -> float:
@@ -28,11 +54,33 @@ class FixedLagSmoother(GraphSmoother):
 
     def solver(self, R_BI: Array) -> Solver:
         """See `GraphSmoother.solver`."""
-        return IncrementalSolver(isam2_params(self.factorization, self.relinearize), R_BI, self.lag_s)
+        return IncrementalSolver(self.isam2_params(), R_BI, self.lag_s, self.extra_updates)
 
 
 @dataclass(frozen=True)
-class WholeLogSmoother(GraphSmoother):
+class BatchFixedLagSmoother(GraphSmoother):
+    """MAP over the last lag_s seconds, solved anew at every keyframe (GTSAM's BatchFixedLagSmoother).
+
+    The same estimate as an iSAM2 that linearises everything anew in every step; a keyframe's cost grows with the lag.
+
+    Attributes:
+        lag_s: length of the window; 0 keeps the newest keyframe alone, and is a filter.
+    """
+
+    lag_s: NonNegative = 3.0
+
+    @property
+    def window_s(self) -> float:
+        """See `GraphSmoother.window_s`."""
+        return self.lag_s
+
+    def solver(self, R_BI: Array) -> Solver:
+        """See `GraphSmoother.solver`."""
+        return BatchLagSolver(self.factorization, R_BI, self.lag_s)
+
+
+@dataclass(frozen=True)
+class WholeLogSmoother(IncrementalSmoother):
     """MAP over the whole log, incrementally (GTSAM's iSAM2, nothing marginalised)."""
 
     hindsight_covariance_s: Positive = 60.0
@@ -44,7 +92,7 @@ class WholeLogSmoother(GraphSmoother):
 
     def solver(self, R_BI: Array) -> Solver:
         """See `GraphSmoother.solver`."""
-        return IncrementalSolver(isam2_params(self.factorization, self.relinearize), R_BI)
+        return IncrementalSolver(self.isam2_params(), R_BI, extra_updates=self.extra_updates)
 
 
 @dataclass(frozen=True)
@@ -56,4 +104,4 @@ class BatchSmoother(WholeLogSmoother):
 
     def solver(self, R_BI: Array) -> Solver:
         """See `GraphSmoother.solver`."""
-        return BatchSolver(isam2_params(self.factorization, self.relinearize), R_BI)
+        return BatchSolver(self.isam2_params(), R_BI, self.extra_updates)

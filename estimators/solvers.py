@@ -35,7 +35,7 @@ class Solver(Protocol):
         ...
 
 
-def isam2_params(factorization: str, relinearize: Thresholds) -> gtsam.ISAM2Params:
+def isam2_params(factorization: str, relinearize: Thresholds, wildfire: float) -> gtsam.ISAM2Params:
     """Return iSAM2's parameters: every update may relinearise, and slots of factors that are gone are used again."""
     rotation, position, velocity, bias = relinearize
     thresholds = gtsam.ISAM2ThresholdMap()
@@ -43,6 +43,7 @@ def isam2_params(factorization: str, relinearize: Thresholds) -> gtsam.ISAM2Para
     thresholds.insert(("v", np.full(3, velocity)))
     thresholds.insert(("b", np.full(6, bias)))
     params = gtsam.ISAM2Params()
+    params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfire))
     params.setFactorization(factorization)
     params.setRelinearizeThreshold(thresholds)
     params.relinearizeSkip = 1
@@ -50,11 +51,23 @@ def isam2_params(factorization: str, relinearize: Thresholds) -> gtsam.ISAM2Para
     return params
 
 
-class IncrementalSolver:
-    """iSAM2, with marginalisation of what is older than lag_s, or without where that is None."""
+def levenberg_marquardt_params(factorization: str) -> gtsam.LevenbergMarquardtParams:
+    """Return Levenberg–Marquardt's parameters; GTSAM's default, Cholesky, fails on IMU noise of a tactical grade."""
+    params = gtsam.LevenbergMarquardtParams()
+    params.setLinearSolverType(f"MULTIFRONTAL_{factorization}")
+    return params
 
-    def __init__(self, params: gtsam.ISAM2Params, R_BI: Array, lag_s: float | None = None) -> None:
-        self._R_BI = R_BI
+
+class IncrementalSolver:
+    """iSAM2, with marginalisation of what is older than lag_s, or without where that is None.
+
+    Each update is one Gauss–Newton step; extra_updates without anything new follow it, a step each.
+    """
+
+    def __init__(
+        self, params: gtsam.ISAM2Params, R_BI: Array, lag_s: float | None = None, extra_updates: int = 0
+    ) -> None:
+        self._R_BI, self._extra_updates = R_BI, extra_updates
         self._lagged = None if lag_s is None else gtsam.IncrementalFixedLagSmoother(lag_s, params)
         self._isam2 = gtsam.ISAM2(params) if self._lagged is None else None
 
@@ -73,12 +86,12 @@ class IncrementalSolver:
             self.isam2.update(graph, values)
         else:
             self._lagged.update(graph, values, stamps)
+        for _ in range(self._extra_updates):
+            self._estimates.update()
 
     def state(self, i: int) -> NavState:
         """See `Solver.state`."""
-        source = self._estimates
-        pose, bias = source.calculateEstimatePose3(X(i)), source.calculateEstimateConstantBias(B(i))
-        return as_state(pose, source.calculateEstimateVector(V(i)), bias, self._R_BI)
+        return _estimate(self._estimates, i, self._R_BI)
 
     def belief(self, i: int, t_ns: int) -> Belief:
         """See `Solver.belief`."""
@@ -90,14 +103,53 @@ class IncrementalSolver:
         """iSAM2 has nothing left to do."""
 
 
+class BatchLagSolver:
+    """GTSAM's BatchFixedLagSmoother: Levenberg–Marquardt over the window at every update, the rest marginalised out.
+
+    Variables that a marginalised one was tied to keep their linearisation point, as in iSAM2; all others are linearised
+    anew in every iteration, so there are no thresholds.
+    """
+
+    def __init__(self, factorization: str, R_BI: Array, lag_s: float) -> None:
+        self._R_BI = R_BI
+        self._smoother = gtsam.BatchFixedLagSmoother(lag_s, levenberg_marquardt_params(factorization))
+
+    def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[Any, Any]) -> None:
+        """See `Solver.update`."""
+        self._smoother.update(graph, values, stamps)
+
+    def state(self, i: int) -> NavState:
+        """See `Solver.state`."""
+        return _estimate(self._smoother, i, self._R_BI)
+
+    def belief(self, i: int, t_ns: int) -> Belief:
+        """See `Solver.belief`. The smoother keeps no factorisation: the window is eliminated anew, by QR, down to i."""
+        state, keys, order = self.state(i), [X(i), V(i), B(i)], gtsam.Ordering()
+        for key in keys:
+            order.push_back(key)
+        window = self._smoother.getFactors().linearize(self._smoother.calculateEstimate())
+        A = window.marginal(keys, gtsam.EliminateQR).jacobian(order)[0]
+        S = np.linalg.inv(np.linalg.qr(A, mode="r"))
+        return Belief(t_ns, state, as_covariance(S @ S.T, state.R_WB, self._R_BI))
+
+    def finish(self) -> None:
+        """Every update has converged."""
+
+
+def _estimate(source: Any, i: int, R_BI: Array) -> NavState:
+    """Return keyframe i of iSAM2 or of a smoother on either."""
+    pose, bias = source.calculateEstimatePose3(X(i)), source.calculateEstimateConstantBias(B(i))
+    return as_state(pose, source.calculateEstimateVector(V(i)), bias, R_BI)
+
+
 class BatchSolver(IncrementalSolver):
     """iSAM2 while the log lasts, for a guess; in the end Levenberg–Marquardt over every factor there was.
 
     Covariances are iSAM2's, whose linearisation points are the optimum's within its thresholds.
     """
 
-    def __init__(self, params: gtsam.ISAM2Params, R_BI: Array) -> None:
-        super().__init__(params, R_BI)
+    def __init__(self, params: gtsam.ISAM2Params, R_BI: Array, extra_updates: int = 0) -> None:
+        super().__init__(params, R_BI, extra_updates=extra_updates)
         self._every_factor = gtsam.NonlinearFactorGraph()
         self._optimum: gtsam.Values | None = None
 
@@ -116,7 +168,6 @@ class BatchSolver(IncrementalSolver):
 
     def finish(self) -> None:
         """Solve the whole log."""
-        params = gtsam.LevenbergMarquardtParams()
-        params.setLinearSolverType("MULTIFRONTAL_QR")  # Cholesky fails on the IMU noise of a tactical grade
+        params = levenberg_marquardt_params("QR")
         guess = self.isam2.calculateBestEstimate()
         self._optimum = gtsam.LevenbergMarquardtOptimizer(self._every_factor, guess, params).optimize()

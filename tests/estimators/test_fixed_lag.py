@@ -202,23 +202,6 @@ def test_a_silent_dvl_leaves_keyframes_to_the_others() -> None:
     assert 36 <= result.counts["keyframes"] <= 43
 
 
-def test_factor_slots_stay_bounded() -> None:
-    log = simulate(replace(TACTICAL, duration_s=100.0), seed=1)
-    run = create("fls", lag_s=3.0).begin(log.prior, log.rig)
-    _drive(run, cut(log).epochs)
-    assert run._solver.isam2.getFactorsUnsafe().size() < 200
-
-
-def test_gtsams_refusal_is_reported_as_divergence_with_its_variable() -> None:
-    """iSAM2's Cholesky cannot solve with IMU noise of a tactical grade; QR can. Should it learn to, tell DESIGN."""
-    log = simulate(replace(TACTICAL, duration_s=20.0), seed=1)
-    result = run_log(log, create("fls", factorization="CHOLESKY"))
-    assert result.status == "diverged"
-    assert "Indeterminate linear system" in result.cause
-    assert "Symbol: " in result.cause
-    assert run_log(log, create("fls")).status == "done"
-
-
 def test_a_long_window_finds_the_optimum_of_its_whole_graph() -> None:
     """Everything the smoother was ever given, solved by Levenberg–Marquardt: the same positions to 1 mm."""
     log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=6)

@@ -38,6 +38,28 @@ def test_isam2_ends_near_the_optimum_and_batch_does_not_depend_on_its_thresholds
     assert gap_m(coarse, batch) < 1e-4
 
 
+@pytest.mark.slow
+def test_isam2_with_nothing_put_off_is_at_the_optimum_at_every_tick() -> None:
+    """Thresholds of 0 and two more steps after each update: Levenberg–Marquardt's positions to 1e-3 mm."""
+    log = simulate(Scenario(duration_s=60.0, imu="tactical"), seed=5)
+    exact = {"lag_s": 100.0, "relinearize": [0, 0, 0, 0], "wildfire": 0, "extra_updates": 2}
+    fls, batch = (run_log(log, create(n, keyframe_period_s=1.0, **o)) for n, o in (("fls", exact), ("batch", {})))
+    assert fls.counts["keyframes"] == batch.counts["keyframes"]
+    assert np.array_equal(fls.smoothed.t_ns, batch.smoothed.t_ns)
+    assert gap_m(fls.smoothed, batch.smoothed) < 1e-6
+
+
+def test_each_option_of_exactness_brings_isam2_nearer_to_the_optimum() -> None:
+    log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=5)
+    batch = run_log(log, create("batch", keyframe_period_s=1.0)).smoothed
+    fine = {"relinearize": [1e-5, 1e-4, 1e-5, 1e-7]}
+    each = ({}, fine, fine | {"wildfire": 0, "extra_updates": 2})
+    gaps = [gap_m(run_log(log, create("isam2", keyframe_period_s=1.0, **o)).smoothed, batch) for o in each]
+    assert gaps[0] > 2 * gaps[1] > 200 * gaps[2]
+    stale = run_log(log, create("isam2", keyframe_period_s=1.0, wildfire=1.0)).smoothed
+    assert gap_m(stale, batch) > 100 * gaps[0]
+
+
 def test_hindsight_over_the_whole_log_beats_a_lag_which_beats_none() -> None:
     """Velocity, pooled over seeds."""
     squared = {"eskf": 0.0, "fls": 0.0, "batch": 0.0}
