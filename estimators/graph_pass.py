@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
-from ..datasets.epochs import DVL, IMU_SAMPLE, Epoch
+from ..datasets.epochs import DVL, IMU_SAMPLE, SENSOR, Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
@@ -38,7 +38,9 @@ from .gtsam_border import (
 )
 from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
 from .interface import FACTORS, Diverged, Factors, Inflation
+from .measurements import measure
 from .records import as_belief, as_record, split, with_rate_noise
+from .robust import Losses, distance, m_estimator, rows, width, with_loss
 from .solvers import Solver
 
 DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
@@ -84,6 +86,12 @@ class GraphSmoother(ABC):
         merge_ns: a reading this close to a keyframe is taken as of it, and counted.
         factors: the sensors it may use.
         inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
+        robust: loss by sensor, "huber", "cauchy" or "tukey", of the widths of `robust`. Every factor of the sensor has
+            it; `outliers_<sensor>` counts the residuals that are beyond the width when their keyframe leaves. A weight
+            is as fresh as the linearisation of its factor, and stays as it is once a neighbour of its keyframe is
+            marginalised out. Tukey and, less so, Cauchy have no single minimum: what lies beyond the width at the
+            first guess, the IMU's prediction, has no pull and is not reconsidered unless others move the estimate. So
+            a vehicle that is lost by more than the width never hears that sensor again.
         factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
         hindsight_covariance_s: period at which states with hindsight keep their covariance.
     """
@@ -96,6 +104,7 @@ class GraphSmoother(ABC):
     merge_ns: int = Field(default=5_000_000, ge=0)
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
+    robust: Losses = Field(default_factory=dict)
     factorization: Literal["QR", "CHOLESKY"] = "QR"
     hindsight_covariance_s: Positive = 5.0
 
@@ -134,6 +143,7 @@ class Keyframe:
         imu: samples from it to the next keyframe.
         next_ns: time of the next keyframe, if there is one.
         dvl: DVL readings from it to the next keyframe, in order.
+        doubted: factors on it under a loss, each with its sensor and the loss's width.
     """
 
     index: int
@@ -142,6 +152,7 @@ class Keyframe:
     imu: NDArray[Any]
     next_ns: int | None = None
     dvl: list[NDArray[Any]] = field(default_factory=list)
+    doubted: list[tuple[str, Any, float]] = field(default_factory=list)
 
 
 class GraphPass:
@@ -153,6 +164,7 @@ class GraphPass:
         self._rig = compile_rig(rig, config.factors, config.inflate)
         self._R_BI = rig.imu.R_BS
         self._silence_ns = int((config.period_s + LONGEST_SILENCE_S) * 1e9)
+        self._losses = [config.robust.get(sensor) for sensor in SENSOR]
         self._inflate: list[float] = self._rig["inflate"][0].tolist()
         self._start_ns = self._now_ns = self._dvl_heard_ns = prior.t_ns
         self._solver = config.solver(rig.imu.R_BS)
@@ -205,7 +217,7 @@ class GraphPass:
                 self._add_reading(self._window[-1], reading)
             self._flush()
             self._solver.finish()
-            self._leave(list(self._window))
+            self._leave(list(self._window), gtsam.Values())
         return Trajectory.from_beliefs(self._hindsight, self._config.window_s) if self._hindsight else None
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
@@ -284,7 +296,7 @@ class GraphPass:
         leaving = []
         while self._window and self._window[0].t_ns < horizon_ns and self._window[0] is not new:
             leaving.append(self._window.popleft())
-        self._leave(leaving)
+        self._leave(leaving, values)
         stamps: dict[Any, Any] = {key(new.index): t_s for key in (X, V, B)}
         self._solver.update(self._graph, values, stamps)
         state = self._solver.state(new.index)
@@ -310,12 +322,22 @@ class GraphPass:
         t_ns = _time_of(reading)
         if abs(t_ns - keyframe.t_ns) <= self._config.merge_ns:
             self.counts["merged"] += int(t_ns != keyframe.t_ns)
-            self._graph.add(reading_factor(keyframe.index, reading, self._rig))
+            self._add(keyframe, int(reading["kind"][0]), reading_factor(keyframe.index, reading, self._rig))
             return
         self.counts["carried"] += 1
         state = self._state if keyframe is self._window[-1] else self._state_of(keyframe)
         record, block = self._block(keyframe, state, t_ns)
-        self._graph.add(carried_factor(keyframe.index, reading, block, record, self._rig))
+        factor = carried_factor(keyframe.index, reading, block, record, self._rig)
+        self._add(keyframe, int(reading["kind"][0]), factor)
+
+    def _add(self, keyframe: Keyframe, kind: int, factor: Any) -> None:
+        """Add a factor of a sensor's readings, under the sensor's loss if it has one."""
+        loss = self._losses[kind]
+        if loss is not None:
+            limit = width(loss, rows(factor))
+            factor = with_loss(factor, loss)
+            keyframe.doubted.append((SENSOR[kind], factor, limit))
+        self._graph.add(factor)
 
     def _sum_or_use(self, last: Keyframe, new: Keyframe, reading: NDArray[Any]) -> None:
         """Keep a DVL reading for the interval that it begins or lies in; at a keyframe, by velocity if asked for."""
@@ -351,7 +373,7 @@ class GraphPass:
             factor = tight_displacement_factor(last.index, new.index, displacement, self._rig)
         else:
             factor = displacement_factor(last.index, new.index, displacement["dp"][0], displacement["N"][0, 3:, 3:])
-        self._graph.add(factor)
+        self._add(last, DVL, factor)
 
     # --- states between keyframes ------------------------------------------------------------------------------------
 
@@ -394,15 +416,29 @@ class GraphPass:
             if len(part):
                 propagate(state, self._rig, before, part, block)
                 before = part[-1:]
-            if reading is not None and not correct(state, self._rig, reading):
+            if reading is not None and not correct(state, self._rig, self._weighted(reading, state)):
                 raise Diverged("the innovation covariance is not positive, or the state is not finite")
         return as_belief(self._now_ns, state)
 
+    def _weighted(self, reading: NDArray[Any], state: NDArray[Any]) -> NDArray[Any]:
+        """Return a reading of the noise that its loss leaves it with at a predicted state (a STATE record)."""
+        loss = self._losses[int(reading["kind"][0])]
+        r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
+        if loss is None or not (n := measure(reading, 0, state, self._rig, r, H, C)):
+            return reading
+        d = np.sqrt(r[:n] @ np.linalg.solve(C[:n, :n], r[:n]))
+        weight = m_estimator(loss, n).weight(d)
+        reading = reading.copy()
+        reading["sigma"] = reading["sigma"] / np.sqrt(weight) if weight > 0 else np.inf
+        return reading
+
     # --- hindsight ---------------------------------------------------------------------------------------------------
 
-    def _leave(self, keyframes: list[Keyframe]) -> None:
-        """Record the ticks from each keyframe to the next, as the smoother sees them now."""
+    def _leave(self, keyframes: list[Keyframe], new: gtsam.Values) -> None:
+        """Record the ticks from each keyframe to the next, as the smoother sees them now; `new` is what it will get."""
         for keyframe in keyframes:
+            if keyframe.doubted:
+                self._count_outliers(keyframe, gtsam.Values(new))
             until_ns = self._now_ns + 1 if keyframe.next_ns is None else keyframe.next_ns
             while self._ticks and self._ticks[0] < until_ns:
                 t_ns = self._ticks.popleft()
@@ -412,6 +448,14 @@ class GraphPass:
                 else:
                     belief = Belief(keyframe.t_ns, self._state_of(keyframe), np.full((15, 15), np.nan))
                 self._hindsight.append(with_rate_noise(self._carry(keyframe, belief, t_ns), self._rig))
+
+    def _count_outliers(self, keyframe: Keyframe, values: gtsam.Values) -> None:
+        """Count the factors on a keyframe that end beyond the width of their loss."""
+        for sensor, factor, limit in keyframe.doubted:
+            for i in {gtsam.Symbol(key).index() for key in factor.keys()}:  # noqa: SIM118 - a factor is no dict
+                if not values.exists(X(i)):
+                    insert_state(values, i, self._solver.state(i), self._R_BI)
+            self.counts[f"outliers_{sensor}"] += int(distance(factor, values) > limit)
 
 
 def _time_of(reading: NDArray[Any]) -> int:

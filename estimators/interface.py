@@ -17,24 +17,25 @@ FACTORS = frozenset({"depth", "gps", "heading", "dvl"})
 """The aiding sensors that an estimator may be allowed."""
 
 
-def _known(names: Collection[str], known: frozenset[str]) -> None:
+def check_sensors(names: Collection[str], known: frozenset[str]) -> None:
+    """Raise ValueError, with the nearest known name, where a sensor is not one of those known."""
     for name in names:
         if name not in known:
             raise ValueError(f"no sensor {name!r}{nearest(name, known)} (known: {', '.join(sorted(known))})")
 
 
 def _factors(names: frozenset[str]) -> frozenset[str]:
-    _known(names, FACTORS)
+    check_sensors(names, FACTORS)
     return names
 
 
 def _inflate(factor_by_sensor: dict[str, float]) -> dict[str, float]:
-    _known(factor_by_sensor, FACTORS | {"gyro", "accel"})
+    check_sensors(factor_by_sensor, FACTORS | {"gyro", "accel"})
     return factor_by_sensor
 
 
 def _gate(probability_by_sensor: dict[str, float]) -> dict[str, float]:
-    _known(probability_by_sensor, FACTORS)
+    check_sensors(probability_by_sensor, FACTORS)
     return probability_by_sensor
 
 

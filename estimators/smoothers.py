@@ -23,7 +23,8 @@ class IncrementalSmoother(GraphSmoother):
 
     Attributes:
         relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
-            linearises a variable anew. Position enters every factor linearly but for its rotation into B.
+            linearises a variable anew. Position enters every factor linearly but for its rotation into B; under a
+            loss (`robust`), whose weights are renewed with the linearisation, give it a part of the sensor's sigma.
         wildfire: an update goes down the tree as far as variables move by more than this (in their own units).
         extra_updates: Gauss–Newton steps after the one that takes in new factors.
     """

@@ -31,6 +31,8 @@ def test_every_estimator_is_a_frozen_configuration_with_defaults(name: str) -> N
         ("fls", {"wildfire": -1e-3}, "wildfire"),
         ("fls", {"extra_updates": -1}, "extra_updates"),
         ("fls-batch", {"wildfire": 0.0}, "no option 'wildfire'"),
+        ("fls", {"robust": {"gsp": "huber"}}, "did you mean 'gps'"),
+        ("batch", {"robust": {"gps": "hubert"}}, "'huber', 'cauchy' or 'tukey'"),
         ("fls", {"dvl": ["preintegrated"]}, "preintegrated-loose"),
         ("fls", {"dvl": ["preintegrated-loose", "preintegrated-tight"]}, "used twice"),
         ("eskf", {"factors": ["dvll"]}, "did you mean 'dvl'"),
