@@ -176,6 +176,9 @@ class GraphPass:
         self._hindsight: list[Belief] = []
         self._covariance_due_ns = prior.t_ns
         self._window: deque[Keyframe] = deque([Keyframe(0, prior.t_ns, None, np.zeros(0, IMU_SAMPLE))])
+        certain = np.flatnonzero(prior.P.diagonal() == 0.0)
+        if len(certain):
+            raise Diverged(f"the prior has no variance in error component {certain[0]}; a graph needs some in each")
         self._graph.add(prior_factor(as_record(prior), self._rig))
         values = gtsam.Values()
         insert_state(values, 0, prior.state, self._R_BI)
