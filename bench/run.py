@@ -153,8 +153,7 @@ class Examiner:
     left out, for they speak of an earlier state; so are those of an estimator that keeps no covariance.
 
     Attributes:
-        counts: readings left out because they came late ("nis_late"), or because the belief has S no covariance
-            ("nis_undefined").
+        counts: readings left out because they came late ("nis_late"), or because S is not positive ("nis_undefined").
     """
 
     def __init__(self, estimator: Estimator, rig: Rig) -> None:
