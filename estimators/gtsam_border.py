@@ -339,11 +339,21 @@ def as_state(pose: gtsam.Pose3, v_WB_W: Array, bias: gtsam.imuBias.ConstantBias,
     return NavState(T_WB[:3, :3], T_WB[:3, 3], v_WB_W, R_BI.T @ b_B[:3], R_BI.T @ b_B[3:])
 
 
-def as_covariance(joint: Array, R_WB: Array, R_BI: Array) -> Array:
-    """Return GTSAM's joint covariance of (pose, velocity, bias) as that of our error state, (15, 15)."""
+def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array | None = None) -> Array:
+    """Return GTSAM's joint covariance of (pose, velocity, bias) as that of our error state, (15, 15), at R_WB.
+
+    Args:
+        joint: (15, 15) in GTSAM's tangents.
+        R_WB: the estimate's.
+        R_BI: the IMU's mounting.
+        R_WB_linearised: where the factors were linearised, if not at the estimate: iSAM2 leaves that be until a
+            variable has moved by a threshold. In the axes of this one a factor sees a position move, and a metre that
+            nothing has measured, seen in axes a hundredth of a radian off, would outweigh what depth says.
+    """
+    R_at = R_WB if R_WB_linearised is None else R_WB_linearised
     G = np.zeros((15, 15))
-    G[THETA, THETA] = G[VELOCITY, VELOCITY] = np.eye(3)
-    G[POSITION, POSITION] = R_WB
+    G[THETA, THETA], G[VELOCITY, VELOCITY] = right_jacobian(log(product(R_at.T, R_WB))), np.eye(3)
+    G[POSITION, POSITION] = R_at
     G[ACCEL_BIAS, ACCEL_BIAS] = G[GYRO_BIAS, GYRO_BIAS] = R_BI.T
     return G @ joint @ G.T
 

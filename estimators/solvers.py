@@ -97,7 +97,8 @@ class IncrementalSolver:
         """See `Solver.belief`."""
         state = self.state(i)
         joint = self.isam2.jointMarginalCovariance([X(i), V(i), B(i)]).fullMatrix()
-        return Belief(t_ns, state, as_covariance(joint, state.R_WB, self._R_BI))
+        linearised_at = self.isam2.getLinearizationPoint().atPose3(X(i)).rotation().matrix()
+        return Belief(t_ns, state, as_covariance(joint, state.R_WB, self._R_BI, linearised_at))
 
     def finish(self) -> None:
         """iSAM2 has nothing left to do."""
@@ -145,7 +146,7 @@ def _estimate(source: Any, i: int, R_BI: Array) -> NavState:
 class BatchSolver(IncrementalSolver):
     """iSAM2 while the log lasts, for a guess; in the end Levenberg–Marquardt over every factor there was.
 
-    Covariances are iSAM2's, whose linearisation points are the optimum's within its thresholds.
+    Covariances are iSAM2's, whose linearisation points are the optimum's within its thresholds, in the optimum's axes.
     """
 
     def __init__(self, params: gtsam.ISAM2Params, R_BI: Array, extra_updates: int = 0) -> None:
