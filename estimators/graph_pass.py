@@ -40,7 +40,7 @@ from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, pr
 from .interface import FACTORS, Diverged, Factors, Inflation
 from .measurements import measure
 from .records import as_belief, as_record, split, with_rate_noise
-from .robust import Losses, distance, m_estimator, rows, width, with_loss
+from .robust import Loss, Losses, distance, m_estimator, rows, width, with_loss
 from .solvers import Solver
 
 DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
@@ -164,7 +164,7 @@ class GraphPass:
         self._rig = compile_rig(rig, config.factors, config.inflate)
         self._R_BI = rig.imu.R_BS
         self._silence_ns = int((config.period_s + LONGEST_SILENCE_S) * 1e9)
-        self._losses = [config.robust.get(sensor) for sensor in SENSOR]
+        self._losses: list[Loss | None] = [config.robust.get(sensor) for sensor in SENSOR]
         self._inflate: list[float] = self._rig["inflate"][0].tolist()
         self._start_ns = self._now_ns = self._dvl_heard_ns = prior.t_ns
         self._solver = config.solver(rig.imu.R_BS)

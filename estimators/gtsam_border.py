@@ -365,7 +365,7 @@ def gtsam_failures() -> Iterator[None]:
         yield
     except Diverged:
         raise
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, IndexError) as error:
         text = " ".join(str(error).split())
         named = re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), text)
         raise Diverged(f"GTSAM: {named[:300]}") from None

@@ -11,7 +11,8 @@ from fathom.datasets import Trajectory
 from fathom.datasets.epochs import cut
 from fathom.datasets.scenario import DvlSpec, GpsSpec, HeadingSpec, Scenario
 from fathom.datasets.simulator import simulate
-from fathom.estimators import create
+from fathom.estimators import Diverged, create
+from fathom.estimators.gtsam_border import gtsam_failures
 from fathom.estimators.solvers import BatchSolver
 
 TACTICAL = Scenario(duration_s=60.0, imu="tactical")
@@ -118,6 +119,15 @@ def test_a_factor_on_a_variable_that_is_gone_ends_the_run_as_diverged(
     assert result.status == "diverged"
     assert "x12345" in result.cause
     assert result.failed_at_s == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("name", ON_GTSAM)
+def test_a_state_that_is_gone_is_a_divergence_too(name: str) -> None:
+    """Of another exception: what C++ calls out of range, Python calls an IndexError."""
+    log = simulate(replace(TACTICAL, duration_s=20.0), seed=1)
+    run = create(name).begin(log.prior, log.rig)
+    with pytest.raises(Diverged, match="x12345"), gtsam_failures():
+        run._solver.state(12345)
 
 
 def test_what_the_last_optimisation_throws_ends_the_run_as_diverged(monkeypatch: pytest.MonkeyPatch) -> None:
