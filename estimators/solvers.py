@@ -52,8 +52,13 @@ def isam2_params(factorization: str, relinearize: Thresholds, wildfire: float) -
 
 
 def levenberg_marquardt_params(factorization: str) -> gtsam.LevenbergMarquardtParams:
-    """Return Levenberg–Marquardt's parameters; GTSAM's default, Cholesky, fails on IMU noise of a tactical grade."""
+    """Return Levenberg–Marquardt's parameters; GTSAM's default, Cholesky, fails on IMU noise of a tactical grade.
+
+    Its default bound on the damping, 1e5, is nothing beside information of 1e10: a reading that is far out would leave
+    it without a step that it may take, and standing still in silence.
+    """
     params = gtsam.LevenbergMarquardtParams()
+    params.setlambdaUpperBound(1e30)
     params.setLinearSolverType(f"MULTIFRONTAL_{factorization}")
     return params
 
