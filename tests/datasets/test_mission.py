@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from fathom.datasets.mission import AFLOAT_M, MISSIONS, Motion, fly, rotations
+from fathom.datasets.mission import MISSIONS, fly
+from fathom.datasets.motion import AFLOAT_M, Motion, rotations
 from fathom.datasets.scenario import Scenario
 from scipy.spatial.transform import Rotation
 

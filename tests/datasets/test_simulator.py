@@ -7,25 +7,13 @@ import numpy as np
 import pytest
 from fathom.datasets import DatasetError, ImuNoise, Log
 from fathom.datasets.epochs import cut
+from fathom.datasets.imu_grades import IMU_GRADES
+from fathom.datasets.inertial import simulate_biases, simulate_white_noise
 from fathom.datasets.mission import MISSIONS, fly
-from fathom.datasets.scenario import (
-    IMU_GRADES,
-    DepthSpec,
-    DvlSpec,
-    GpsSpec,
-    HeadingSpec,
-    MountingSpec,
-    PriorSpec,
-    Scenario,
-)
-from fathom.datasets.simulator import (
-    RANDOM_STREAMS,
-    janus_beams,
-    random_stream,
-    simulate,
-    simulate_biases,
-    simulate_white_noise,
-)
+from fathom.datasets.random_streams import RANDOM_STREAMS, random_stream
+from fathom.datasets.scenario import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, MountingSpec, PriorSpec, Scenario
+from fathom.datasets.sensors import janus_beams
+from fathom.datasets.simulator import simulate
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest, uniform
