@@ -14,11 +14,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .motion import Motion
+from .errors import DatasetError
+from .motion import AFLOAT_M, Motion
+from .random_streams import random_stream
+from .recorded_path import follow
 from .state import Array
 
 if TYPE_CHECKING:
     from .scenario import Scenario
+    from .trajectory import Trajectory
 
 KNOT_S = 0.1
 SMOOTHING_S = 1.5
@@ -35,22 +39,42 @@ class Plan:
     """What tells one mission from another.
 
     Attributes:
-        turns_deg: course changes after each leg, over and over; counter-clockwise positive.
+        turns_deg: course changes, over and over; counter-clockwise positive.
         sawtooth: whether the vehicle keeps climbing and diving between two depths, or runs level at the deeper.
+        legs: whether a straight leg comes before each course change; without, the vehicle climbs by the turn.
     """
 
     turns_deg: tuple[float, ...]
-    sawtooth: bool
+    sawtooth: bool = False
+    legs: bool = True
 
 
 MISSIONS = {
-    "lawnmower": Plan(turns_deg=(180.0, -180.0), sawtooth=False),
+    "lawnmower": Plan(turns_deg=(180.0, -180.0)),
     "yo-yo": Plan(turns_deg=(70.0, -100.0, 60.0, -30.0), sawtooth=True),
+    "helix": Plan(turns_deg=(360.0,), sawtooth=True, legs=False),
+    "box": Plan(turns_deg=(90.0,)),
+    "transit": Plan(turns_deg=(0.0,)),
 }
+RECORDED = "recorded"
+"""The mission whose path is a trajectory of somebody's."""
 
 
-def fly(scenario: Scenario, rng: np.random.Generator) -> Motion:
-    """Return the motion of a scenario's mission; rng draws the phases of the wobble."""
+def fly(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Motion:
+    """Return the motion of a scenario's mission; a recorded one follows `path`, or the scenario's file.
+
+    Raises:
+        DatasetError: a recorded mission has no path, or one that no vehicle can follow; or another mission has one.
+    """
+    if scenario.mission == RECORDED:
+        return follow(scenario, path)
+    if path is not None:
+        raise DatasetError(f"simulate: mission {scenario.mission} takes no path; only mission {RECORDED!r} follows one")
+    return draw(scenario, random_stream(seed, "mission"))
+
+
+def draw(scenario: Scenario, rng: np.random.Generator) -> Motion:
+    """Return the motion of one of MISSIONS; rng draws the phases of the wobble."""
     plan = MISSIONS[scenario.mission]
     t_s = np.arange(-MARGIN_S, scenario.duration_s + MARGIN_S, KNOT_S)
     rock = wobble(t_s, rng)
@@ -63,8 +87,9 @@ def fly(scenario: Scenario, rng: np.random.Generator) -> Motion:
     bank = np.arctan(horizontal * np.gradient(course, KNOT_S) / scenario.gravity_mps2)
 
     v_WB_W = np.stack([horizontal * np.cos(course), horizontal * np.sin(course), vertical], axis=1)
-    along = np.stack([-bank, -np.arcsin(vertical / speed), course], axis=1)
-    return Motion(t_s, v_WB_W, along + math.radians(scenario.wobble_deg) * rock[:, :3])
+    angles = np.stack([-bank, -np.arcsin(vertical / speed), course], axis=1)
+    angles += math.radians(scenario.wobble_deg) * rock[:, :3]
+    return Motion.from_velocity(t_s, v_WB_W, angles, np.array([0.0, 0.0, AFLOAT_M]))
 
 
 def depth_profile(scenario: Scenario, plan: Plan, t_s: Array) -> Array:
@@ -75,7 +100,7 @@ def depth_profile(scenario: Scenario, plan: Plan, t_s: Array) -> Array:
     legs = max(1, round(scenario.duration_s / scenario.surface_every_s))
     period_s = scenario.duration_s / legs
     half_s = min(scenario.surface_for_s / 2, period_s / 4)
-    rate_mps = scenario.speed_mps * math.sin(math.radians(scenario.climb_deg))
+    rate_mps = scenario.speed_mps * math.sin(climb_angle(scenario, plan))
     phase_s = np.mod(t_s, period_s)
     dived_m = rate_mps * np.maximum(0.0, phase_s - half_s)
     to_climb_m = rate_mps * np.maximum(0.0, period_s - phase_s - half_s)
@@ -86,10 +111,17 @@ def depth_profile(scenario: Scenario, plan: Plan, t_s: Array) -> Array:
     return np.minimum(run_m, to_climb_m)
 
 
+def climb_angle(scenario: Scenario, plan: Plan) -> float:
+    """Return the angle of every climb and dive, rad; one turn of a helix climbs by its pitch."""
+    if plan.legs:
+        return math.radians(scenario.climb_deg)
+    return math.atan2(scenario.helix_pitch_m, 2 * math.pi * scenario.turn_radius_m)
+
+
 def course_profile(scenario: Scenario, plan: Plan, travelled_m: Array) -> Array:
-    """Return the course (n,) rad after each distance travelled (n,) m: straight legs joined by arcs."""
+    """Return the course (n,) rad after each distance travelled (n,) m: straight legs and arcs."""
     turns = np.radians(plan.turns_deg)
-    each_m = scenario.leg_m + np.abs(turns) * scenario.turn_radius_m
+    each_m = plan.legs * scenario.leg_m + np.abs(turns) * scenario.turn_radius_m
     repeats = math.ceil(max(travelled_m[-1], 0.0) / each_m.sum()) + 1
     turns, arcs_m = np.tile(turns, repeats), np.tile(np.abs(turns) * scenario.turn_radius_m, repeats)
     ends_m = np.cumsum(np.tile(each_m, repeats))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,23 +26,36 @@ class Kinematics(NamedTuple):
     alpha_WB_B: Array  # (n, 3) rad/s², the derivative of w_WB_B
 
 
+@dataclass(frozen=True, eq=False)
 class Motion:
     """A path as splines of time, in seconds from the start.
 
     Attributes:
-        velocity: spline of v_WB_W, m/s.
-        position: its antiderivative from the start at (0, 0, AFLOAT_M), m.
+        position: spline of p_WB_W, m.
+        velocity: its derivative, v_WB_W, m/s.
         angles: spline of (phi, theta, psi), rad, with R_WB = Rz(psi) Ry(theta) Rx(phi); in a forward-left-up body a
             raised nose has theta < 0.
+        notes: how it was made, where a mission's name does not say it.
     """
 
-    def __init__(self, t_s: Array, v_WB_W: Array, angles: Array) -> None:
-        self.velocity: BSpline = make_interp_spline(t_s, v_WB_W, k=5)
-        self.angles: BSpline = make_interp_spline(t_s, angles, k=5)
-        self.position: BSpline = self.velocity.antiderivative()
+    position: BSpline
+    velocity: BSpline
+    angles: BSpline
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def from_velocity(cls, t_s: Array, v_WB_W: Array, angles: Array, p_0: Array) -> Motion:
+        """Lay quintic splines through v_WB_W and the angles, (n, 3), at times t_s (n,); position p_0 is at time 0."""
+        velocity = make_interp_spline(t_s, v_WB_W, k=5)
+        position = velocity.antiderivative()
         # a B-spline's basis sums to one: shifting every coefficient shifts the curve
-        self.position.c += np.array([0.0, 0.0, AFLOAT_M]) - self.position(0.0)
-        self.acceleration: BSpline = self.velocity.derivative()
+        position.c += p_0 - position(0.0)
+        return cls(position, velocity, make_interp_spline(t_s, angles, k=5))
+
+    @cached_property
+    def acceleration(self) -> BSpline:
+        """Spline of a_WB_W, m/s²."""
+        return self.velocity.derivative()
 
     def at(self, t_s: Array) -> Kinematics:
         """Return the motion at times t_s (n,)."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError, nearest
 from .imu_grades import IMU_GRADES
-from .mission import MISSIONS
+from .mission import MISSIONS, RECORDED
 from .quantities import STRICT, Finite, NotNegative, Positive, Vector
 from .rig import ImuNoise, Mounting, Rig
 
@@ -101,21 +101,27 @@ class Scenario:
     `delay_s` after it was true, and at random up to `disorder_s` later still, so that readings overtake one another.
     """
 
-    mission: str = "lawnmower"
+    mission: str = "lawnmower"  # a name in MISSIONS, or "recorded"
     duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
     imu: Imu = "tactical"  # a name in IMU_GRADES, or figures of one's own
 
     # the path
     speed_mps: Positive = 1.5
-    depth_m: Positive = 20.0  # where the lawnmower runs, and the yo-yo turns upwards
-    shallow_m: NotNegative = 5.0  # where the yo-yo turns downwards
-    climb_deg: Annotated[float, Field(gt=0, le=45)] = 20.0  # of every climb and dive
+    depth_m: Positive = 20.0  # where level missions run, and yo-yo and helix turn upwards
+    shallow_m: NotNegative = 5.0  # where yo-yo and helix turn downwards
+    climb_deg: Annotated[float, Field(gt=0, le=45)] = 20.0  # of every climb and dive, but the helix's
+    helix_pitch_m: Positive = 10.0  # depth that one turn of the helix gains
     leg_m: Positive = 100.0
     turn_radius_m: Positive = 10.0
     course_deg: Finite = 30.0  # of the first leg
     surface_every_s: Positive = 270.0
     surface_for_s: Positive = 36.0  # half of it at the start and at the end
     wobble_deg: Annotated[float, Field(ge=0, le=10)] = 1.5  # of roll, pitch and yaw, about the path's own
+
+    # a recorded path: east-north-up, its z = 0 at the surface; all but the vehicle and the sensors is then in the file
+    path: str | None = None  # a TUM file; relative to where the command runs
+    path_start_s: NotNegative = 0.0  # when the log begins, after the path's first pose
+    path_spacing_s: Positive | None = None  # between the knots of smoothing splines; None: through every pose
 
     # the vehicle
     gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
@@ -137,8 +143,9 @@ class Scenario:
     @field_validator("mission")
     @classmethod
     def _known_mission(cls, name: str) -> str:
-        if name not in MISSIONS:
-            raise ValueError(f"no mission {name!r}{nearest(name, MISSIONS)}; known: {', '.join(MISSIONS)}")
+        known = [*MISSIONS, RECORDED]
+        if name not in known:
+            raise ValueError(f"no mission {name!r}{nearest(name, known)}; known: {', '.join(known)}")
         return name
 
     @field_validator("imu")
@@ -154,8 +161,14 @@ class Scenario:
 
     @model_validator(mode="after")
     def _saw_has_teeth(self) -> Scenario:
-        if MISSIONS[self.mission].sawtooth and self.shallow_m >= self.depth_m:
+        if self.mission in MISSIONS and MISSIONS[self.mission].sawtooth and self.shallow_m >= self.depth_m:
             raise ValueError(f"{self.mission}: shallow_m {self.shallow_m} must be less than depth_m {self.depth_m}")
+        return self
+
+    @model_validator(mode="after")
+    def _only_the_recorded_mission_has_a_path(self) -> Scenario:
+        if self.path is not None and self.mission != RECORDED:
+            raise ValueError(f"mission {self.mission} takes no `path`; only mission {RECORDED!r} follows one")
         return self
 
     @classmethod
@@ -167,6 +180,8 @@ class Scenario:
         """
         if not isinstance(values, Mapping):
             raise DatasetError(f"{source}: expected a mapping of keys, found {values!r}")
+        if values.get("mission") == RECORDED and values.get("path") is None:
+            raise DatasetError(f"{source}: mission {RECORDED!r} needs `path`, a TUM file")
         try:
             return cls(**{str(key): value for key, value in values.items()})
         except ValidationError as error:
@@ -186,6 +201,11 @@ class Scenario:
     def to_dict(self) -> dict[str, Any]:
         """Inverse of `from_dict`: plain values, ready for YAML."""
         return dataclasses.asdict(self)
+
+    @property
+    def reach_s(self) -> tuple[float, float]:
+        """From when to when the sensors look at the motion, from the log's start."""
+        return 0.0, self.duration_s
 
     @property
     def imu_noise(self) -> ImuNoise:

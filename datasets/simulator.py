@@ -16,15 +16,20 @@ from .state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Belief
 from .trajectory import Trajectory
 
 
-def simulate(scenario: Scenario, seed: int) -> Log:
+def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Log:
     """Return the log of one scenario; the same seed gives the same log, bit for bit, on one machine type.
 
+    Args:
+        scenario: what to simulate.
+        seed: of every random stream.
+        path: what the mission "recorded" follows, in place of the scenario's file.
+
     Raises:
-        DatasetError: the seed is negative.
+        DatasetError: the seed is negative, or the path is none that a vehicle can follow.
     """
     if seed < 0:
         raise DatasetError(f"simulate: seed must not be negative, found {seed}")
-    motion, rig, start_ns = fly(scenario, random_stream(seed, "mission")), scenario.rig, scenario.start_ns
+    motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
     imu_ns = ticks(scenario.imu_rate_hz, scenario.duration_s)
     edges_ns = np.concatenate([[0], imu_ns])
     biases = simulate_biases(rig.imu_noise, edges_ns, seed) * scenario.noise_scale
@@ -47,6 +52,7 @@ def simulate(scenario: Scenario, seed: int) -> Log:
         notes=(
             f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu_rate_hz:g} Hz, "
             f"seed {seed}, noise scaled by {scenario.noise_scale:g}; the Earth does not turn.",
+            *motion.notes,
             *late(scenario),
         ),
     )
