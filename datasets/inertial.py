@@ -6,13 +6,37 @@ import math
 
 import numpy as np
 
+from .faults import arrives, mar, repeated
+from .log import ImuStream
 from .motion import Motion
 from .random_streams import random_stream
-from .rig import ImuNoise, Rig
+from .rig import ImuNoise, Mounting
+from .scenario import Scenario
 from .state import Array, TimeArray
 
 
-def mean_imu(motion: Motion, rig: Rig, edges_ns: TimeArray) -> tuple[Array, Array]:
+def sample_imu(scenario: Scenario, seed: int, motion: Motion, edges_ns: TimeArray, biases: Array) -> ImuStream:
+    """Return the IMU's samples: means of the motion, plus bias and white noise, marred by its faults.
+
+    Args:
+        scenario: what is simulated.
+        seed: of the noise and the faults.
+        motion: of B.
+        edges_ns: (n + 1,) where the intervals begin and end by the IMU's clock, from the start.
+        biases: (n + 1, 6) of (f, w) at the edges; a sample carries that of its interval's beginning.
+    """
+    faults, noise = scenario.imu_faults, scenario.imu_noise
+    true_ns = edges_ns - round(faults.clock_offset_s * 1e9)
+    signal = np.hstack(mean_imu(motion, scenario.mountings["imu"], scenario.gravity_mps2, true_ns))
+    white = simulate_white_noise(noise, edges_ns, seed) * scenario.noise_scale
+    samples = mar(signal * faults.scale + biases[:-1] + white, faults, "imu", seed)
+    t_ns = edges_ns[1:]
+    heard = arrives(t_ns, faults, "imu", seed)
+    rows = repeated(heard, faults, "imu", seed)
+    return ImuStream(scenario.start_ns + t_ns[heard], samples[rows, 3:], samples[rows, :3])
+
+
+def mean_imu(motion: Motion, imu: Mounting, gravity: float, edges_ns: TimeArray) -> tuple[Array, Array]:
     """Return the means of f_I and w_WI_I over each interval, (n, 3), without noise.
 
     f_I = R_IB (R_BW (a_WB_W − g_W) + alpha × l + w × (w × l)), l = p_BI_B. The mean is Gauss–Legendre's of two nodes,
@@ -20,17 +44,18 @@ def mean_imu(motion: Motion, rig: Rig, edges_ns: TimeArray) -> tuple[Array, Arra
 
     Args:
         motion: of B.
-        rig: its IMU's mounting and gravity.
+        imu: where the IMU really sits.
+        gravity: m/s².
         edges_ns: (n + 1,) where the intervals begin and end, from the start.
     """
     half_s = np.diff(edges_ns) * 0.5e-9
     middle_s = edges_ns[:-1] * 1e-9 + half_s
     f_B, w_WB_B = np.zeros((len(half_s), 3)), np.zeros((len(half_s), 3))
     for node in (-1 / math.sqrt(3), 1 / math.sqrt(3)):
-        f_node, w_node = specific_force(motion, middle_s + node * half_s, rig.imu.p_BS_B, rig.gravity)
+        f_node, w_node = specific_force(motion, middle_s + node * half_s, imu.p_BS_B, gravity)
         f_B += 0.5 * f_node
         w_WB_B += 0.5 * w_node
-    return f_B @ rig.imu.R_BS, w_WB_B @ rig.imu.R_BS
+    return f_B @ imu.R_BS, w_WB_B @ imu.R_BS
 
 
 def specific_force(motion: Motion, t_s: Array, p_BI_B: Array, gravity: float) -> tuple[Array, Array]:
@@ -49,10 +74,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def simulate_biases(noise: ImuNoise, edges_ns: TimeArray, seed: int) -> Array:
-    """Return (b_a, b_g), (n + 1, 6), at the edges: a draw at turn-on, then a random walk.
-
-    A sample carries the bias of its interval's beginning.
-    """
+    """Return (b_a, b_g), (n + 1, 6), at the edges: a draw at turn-on, then a random walk."""
     draws = random_stream(seed, "imu_bias").standard_normal((len(edges_ns), 6))
     draws[0] *= _six(noise.accel_bias_sigma, noise.gyro_bias_sigma)
     draws[1:] *= np.sqrt(np.diff(edges_ns) * 1e-9)[:, None] * _six(noise.accel_walk, noise.gyro_walk)

@@ -12,6 +12,7 @@ DEGREE = math.pi / 180
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Probability = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[Finite, Finite, Finite]
 
 STRICT = ConfigDict(extra="forbid")

@@ -17,6 +17,21 @@ RANDOM_STREAMS = {
     "depth_disorder": 9,
     "gps_disorder": 10,
     "heading_disorder": 11,
+    "imu_outliers": 12,
+    "dvl_outliers": 13,
+    "depth_outliers": 14,
+    "gps_outliers": 15,
+    "heading_outliers": 16,
+    "imu_dropouts": 17,
+    "dvl_dropouts": 18,
+    "depth_dropouts": 19,
+    "gps_dropouts": 20,
+    "heading_dropouts": 21,
+    "imu_repeats": 22,
+    "dvl_repeats": 23,
+    "depth_repeats": 24,
+    "gps_repeats": 25,
+    "heading_repeats": 26,
 }
 """Apart, so that dropping one changes no other. Never renumber."""
 

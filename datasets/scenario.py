@@ -13,6 +13,7 @@ from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError, nearest
+from .faults import AnyFaults, DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults, true_mounting
 from .imu_grades import IMU_GRADES
 from .mission import MISSIONS, RECORDED
 from .quantities import STRICT, Finite, NotNegative, Positive, Vector
@@ -46,6 +47,7 @@ class DvlSpec:
     beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    faults: DvlFaults = DvlFaults()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -56,6 +58,7 @@ class DepthSpec:
     sigma_m: Positive = 0.02
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    faults: DepthFaults = DepthFaults()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -67,6 +70,7 @@ class GpsSpec:
     vertical_sigma_m: Positive = 3.0
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    faults: GpsFaults = GpsFaults()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -78,9 +82,12 @@ class HeadingSpec:
     bias_deg: Finite = 0.0
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    faults: HeadingFaults = HeadingFaults()
 
 
 SensorSpec = DvlSpec | DepthSpec | GpsSpec | HeadingSpec
+SENSORS = ("dvl", "depth", "gps", "heading")
+"""The aiding sensors, by the names of their streams and specs."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -132,6 +139,7 @@ class Scenario:
 
     # the sensors
     imu_rate_hz: Positive = 100.0
+    imu_faults: ImuFaults = ImuFaults()
     dvl: DvlSpec | None = DvlSpec()
     depth: DepthSpec | None = DepthSpec()
     gps: GpsSpec | None = GpsSpec()
@@ -203,9 +211,16 @@ class Scenario:
         return dataclasses.asdict(self)
 
     @property
+    def faults(self) -> dict[str, AnyFaults]:
+        """The faults of the IMU and of every aiding sensor aboard, by sensor name."""
+        aboard = {sensor: getattr(self, sensor) for sensor in SENSORS}
+        return {"imu": self.imu_faults} | {name: spec.faults for name, spec in aboard.items() if spec is not None}
+
+    @property
     def reach_s(self) -> tuple[float, float]:
-        """From when to when the sensors look at the motion, from the log's start."""
-        return 0.0, self.duration_s
+        """From when to when the sensors look at the motion, from the log's start; a wrong clock looks elsewhere."""
+        offsets_s = [faults.clock_offset_s for faults in self.faults.values()]
+        return -max(0.0, *offsets_s), self.duration_s - min(0.0, *offsets_s)
 
     @property
     def imu_noise(self) -> ImuNoise:
@@ -224,12 +239,24 @@ class Scenario:
             gravity=self.gravity_mps2,
         )
 
+    @property
+    def mountings(self) -> dict[str, Mounting]:
+        """Where the IMU and the sensors aboard really sit, by sensor name: the rig's word and their faults."""
+        rig = self.rig
+        stated = {"imu": rig.imu, "dvl": Mounting(), "depth": rig.depth, "gps": rig.gps, "heading": rig.heading}
+        return {sensor: true_mounting(stated[sensor], faults) for sensor, faults in self.faults.items()}
+
 
 NESTED = {
     "dvl": DvlSpec,
+    "dvl.faults": DvlFaults,
     "depth": DepthSpec,
+    "depth.faults": DepthFaults,
     "gps": GpsSpec,
+    "gps.faults": GpsFaults,
     "heading": HeadingSpec,
+    "heading.faults": HeadingFaults,
+    "imu_faults": ImuFaults,
     "prior": PriorSpec,
     "imu": ImuNoise,
     "imu_mounting": MountingSpec,
@@ -241,4 +268,4 @@ NESTED = {
 
 def _fields_at(path: list[str]) -> list[str]:
     """Return the keys known below a key of the scenario, or at its top."""
-    return [field.name for field in dataclasses.fields(NESTED[path[0]] if path else Scenario)]
+    return [field.name for field in dataclasses.fields(NESTED[".".join(path)] if path else Scenario)]

@@ -9,11 +9,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from .faults import arrives, mar, repeated
 from .log import DepthStream, DvlStream, GpsStream, HeadingStream, ReadingStream
 from .motion import Motion
 from .quantities import DEGREE
 from .random_streams import random_stream
-from .rig import Mounting, Rig
+from .rig import Mounting
 from .scenario import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, Scenario, SensorSpec
 from .state import Array, TimeArray
 
@@ -34,32 +35,30 @@ def read(kind: type[Kind], scenario: Scenario, seed: int, motion: Motion) -> Kin
 
     Noise is drawn for every tick, whether or not it gives a reading.
     """
-    spec = getattr(scenario, kind.name)
+    spec: SensorSpec | None = getattr(scenario, kind.name)
     if spec is None:
         return None
+    sensor, faults = kind.name, spec.faults
     t_ns = ticks(spec.rate_hz, scenario.duration_s)
-    z, error, sigma = READ[kind](spec, scenario.rig, motion, t_ns * 1e-9, random_stream(seed, kind.name))
-    heard = np.isfinite(z).all(axis=1)
-    t_ns, z = scenario.start_ns + t_ns[heard], (z + scenario.noise_scale * error)[heard]
+    true_s = t_ns * 1e-9 - faults.clock_offset_s
+    z, error, sigma = READ[kind](spec, scenario.mountings[sensor], motion, true_s, random_stream(seed, sensor))
+    z = mar(z + scenario.noise_scale * error, faults, sensor, seed)
+    heard = np.isfinite(z).all(axis=1) & arrives(t_ns, faults, sensor, seed)
+    rows = repeated(heard, faults, sensor, seed)
+    t_ns, z = scenario.start_ns + t_ns[heard], z[rows]
     if kind is HeadingStream:
         z = np.arctan2(np.sin(z), np.cos(z))
-    return kind(t_ns, t_ns + _delays(spec, kind.name, heard, seed), z, np.tile(sigma, (len(z), 1)))
+    return kind(t_ns, t_ns + _delays(spec, sensor, heard, seed), z, np.broadcast_to(sigma, error.shape)[rows])
 
 
 def _delays(spec: SensorSpec, sensor: str, heard: NDArray[np.bool_], seed: int) -> TimeArray:
-    """Return how long each reading that is heard is on its way, ns: delay_s, and uniformly up to disorder_s more."""
+    """Return how long each reading that is heard is on its way, ns: delay_s, and uniformly up to disorder_s more.
+
+    It is counted from the stamp: a clock that is ahead makes the way look shorter, down to none.
+    """
     more_s = spec.disorder_s * random_stream(seed, f"{sensor}_disorder").random(len(heard))
-    return np.rint((spec.delay_s + more_s[heard]) * 1e9).astype(np.int64)
-
-
-def late(scenario: Scenario) -> list[str]:
-    """Return a sentence on each sensor whose readings come late."""
-    specs = {sensor: getattr(scenario, sensor) for sensor in ("dvl", "depth", "gps", "heading")}
-    return [
-        f"{sensor} comes {spec.delay_s:g} s late, and up to {spec.disorder_s:g} s more, at random."
-        for sensor, spec in specs.items()
-        if spec is not None and (spec.delay_s or spec.disorder_s)
-    ]
+    way_s = np.maximum(spec.delay_s + more_s[heard] - spec.faults.clock_offset_s, 0.0)
+    return np.rint(way_s * 1e9).astype(np.int64)
 
 
 def janus_beams(beam_angle_rad: float) -> Array:
@@ -73,32 +72,37 @@ def janus_beams(beam_angle_rad: float) -> Array:
 # the standard deviation of the residual (m,).
 
 
-def _read_dvl(spec: DvlSpec, rig: Rig, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
+def _read_dvl(spec: DvlSpec, dvl: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
     """v_WB_B by least squares from four beam velocities; (AᵀA)⁻¹ is diagonal, so the three errors are independent."""
     R_WB, _, v_WB_W = motion.pose(t_s)
+    v_WD_B = np.einsum("nji,nj->ni", R_WB, v_WB_W)
+    if dvl.p_BS_B.any():
+        v_WD_B += np.cross(motion.attitude(t_s)[1], dvl.p_BS_B)
     A = janus_beams(spec.beam_angle_deg * DEGREE)
     beam_error = spec.beam_sigma_mps * rng.standard_normal((len(t_s), 4))
     sigma = spec.beam_sigma_mps * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
-    return np.einsum("nji,nj->ni", R_WB, v_WB_W), beam_error @ np.linalg.pinv(A).T, sigma
+    return spec.faults.scale * v_WD_B @ dvl.R_BS, beam_error @ np.linalg.pinv(A).T, sigma
 
 
-def _read_depth(spec: DepthSpec, rig: Rig, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
-    p_WP_W = _point(motion, rig.depth, t_s)
-    return p_WP_W[:, 2:], spec.sigma_m * rng.standard_normal((len(t_s), 1)), np.array([spec.sigma_m])
+def _read_depth(
+    spec: DepthSpec, depth: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator
+) -> tuple[Array, ...]:
+    z_m = spec.faults.scale * _point(motion, depth, t_s)[:, 2:]
+    return z_m, spec.sigma_m * rng.standard_normal((len(t_s), 1)), np.array([spec.sigma_m])
 
 
-def _read_gps(spec: GpsSpec, rig: Rig, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
-    p_WG_W = _point(motion, rig.gps, t_s)
+def _read_gps(spec: GpsSpec, gps: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
+    p_WG_W = _point(motion, gps, t_s)
     sigma = np.array([spec.horizontal_sigma_m, spec.horizontal_sigma_m, spec.vertical_sigma_m])
     afloat = p_WG_W[:, 2:] > ANTENNA_AWASH_M
     return np.where(afloat, p_WG_W, np.nan), sigma * rng.standard_normal((len(t_s), 3)), sigma
 
 
 def _read_heading(
-    spec: HeadingSpec, rig: Rig, motion: Motion, t_s: Array, rng: np.random.Generator
+    spec: HeadingSpec, heading: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator
 ) -> tuple[Array, ...]:
     R_WB, _, _ = motion.pose(t_s)
-    x_H_W = R_WB @ rig.heading.R_BS[:, 0]
+    x_H_W = R_WB @ heading.R_BS[:, 0]
     psi = np.arctan2(x_H_W[:, 1:2], x_H_W[:, :1]) + spec.bias_deg * DEGREE
     sigma = np.array([spec.sigma_deg * DEGREE])
     return psi, sigma * rng.standard_normal((len(t_s), 1)), sigma

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from .errors import DatasetError
-from .inertial import mean_imu, simulate_biases, simulate_white_noise
-from .log import DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
+from .inertial import sample_imu, simulate_biases
+from .log import DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from .mission import fly
 from .quantities import DEGREE
 from .random_streams import random_stream
 from .scenario import Scenario
-from .sensors import late, read, ticks
+from .sensors import read, ticks
 from .state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Belief
+from .telling import told
 from .trajectory import Trajectory
 
 
@@ -30,11 +31,8 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
     if seed < 0:
         raise DatasetError(f"simulate: seed must not be negative, found {seed}")
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
-    imu_ns = ticks(scenario.imu_rate_hz, scenario.duration_s)
-    edges_ns = np.concatenate([[0], imu_ns])
+    edges_ns = np.concatenate([[0], ticks(scenario.imu_rate_hz, scenario.duration_s)])
     biases = simulate_biases(rig.imu_noise, edges_ns, seed) * scenario.noise_scale
-    white = simulate_white_noise(rig.imu_noise, edges_ns, seed) * scenario.noise_scale
-    f_I, w_WI_I = mean_imu(motion, rig, edges_ns)
 
     R_WB, p_WB_W, v_WB_W = motion.pose(edges_ns * 1e-9)
     truth = Trajectory(start_ns + edges_ns, R_WB, p_WB_W, v_WB_W, b_a=biases[:, :3], b_g=biases[:, 3:])
@@ -42,7 +40,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
     return Log(
         name=f"{scenario.mission}-{grade}-s{seed}",
         rig=rig,
-        imu=ImuStream(start_ns + imu_ns, w_WI_I + biases[:-1, 3:] + white[:, 3:], f_I + biases[:-1, :3] + white[:, :3]),
+        imu=sample_imu(scenario, seed, motion, edges_ns, biases),
         dvl=read(DvlStream, scenario, seed, motion),
         depth=read(DepthStream, scenario, seed, motion),
         gps=read(GpsStream, scenario, seed, motion),
@@ -53,7 +51,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
             f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu_rate_hz:g} Hz, "
             f"seed {seed}, noise scaled by {scenario.noise_scale:g}; the Earth does not turn.",
             *motion.notes,
-            *late(scenario),
+            *told(scenario),
         ),
     )
 
