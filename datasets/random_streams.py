@@ -32,6 +32,7 @@ RANDOM_STREAMS = {
     "depth_repeats": 24,
     "gps_repeats": 25,
     "heading_repeats": 26,
+    "dvl_beams": 27,
 }
 """Apart, so that dropping one changes no other. Never renumber."""
 

@@ -16,8 +16,9 @@ from .errors import DatasetError, nearest
 from .faults import AnyFaults, DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults, true_mounting
 from .imu_grades import IMU_GRADES
 from .mission import MISSIONS, RECORDED
-from .quantities import STRICT, Finite, NotNegative, Positive, Vector
+from .quantities import STRICT, Finite, NotNegative, Positive, Probability, Vector
 from .rig import ImuNoise, Mounting, Rig
+from .seabed import SeabedSpec
 
 Imu = Annotated[
     Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
@@ -40,11 +41,16 @@ class MountingSpec:
 
 @dataclass(frozen=True, config=STRICT)
 class DvlSpec:
-    """Four-beam Janus DVL at B. 5 mm/s per beam: Nortek DVL1000, RDI WHN600; 22.5°: Water Linked A50."""
+    """Four-beam Janus DVL at B. 5 mm/s per beam: Nortek DVL1000, RDI WHN600; 22.5° and 0.05–50 m: Water Linked A50."""
 
     rate_hz: Positive = 5.0
     beam_sigma_mps: Positive = 0.005
     beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
+    min_range_m: NotNegative = 0.05  # along each beam, where there is a seabed
+    max_range_m: Positive = 50.0
+    max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] | None = None  # of its axis from the vertical
+    beam_loss_probability: Probability = 0.0  # of each beam of each reading
+    three_beams: bool = True  # whether three beams are enough for a reading
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
     faults: DvlFaults = DvlFaults()
@@ -84,6 +90,9 @@ class HeadingSpec:
     disorder_s: NotNegative = 0.0
     faults: HeadingFaults = HeadingFaults()
 
+
+CLEARANCE_M = 0.5
+"""Least height of a mission's deepest point above the seabed."""
 
 SensorSpec = DvlSpec | DepthSpec | GpsSpec | HeadingSpec
 SENSORS = ("dvl", "depth", "gps", "heading")
@@ -130,6 +139,9 @@ class Scenario:
     path_start_s: NotNegative = 0.0  # when the log begins, after the path's first pose
     path_spacing_s: Positive | None = None  # between the knots of smoothing splines; None: through every pose
 
+    # the world
+    seabed: SeabedSpec | None = None  # None: always within the DVL's range
+
     # the vehicle
     gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
     imu_mounting: MountingSpec = MountingSpec((180.0, 2.0, 87.0), (-0.35, 0.05, 0.12))
@@ -171,6 +183,16 @@ class Scenario:
     def _saw_has_teeth(self) -> Scenario:
         if self.mission in MISSIONS and MISSIONS[self.mission].sawtooth and self.shallow_m >= self.depth_m:
             raise ValueError(f"{self.mission}: shallow_m {self.shallow_m} must be less than depth_m {self.depth_m}")
+        return self
+
+    @model_validator(mode="after")
+    def _stays_off_the_ground(self) -> Scenario:
+        if self.mission in MISSIONS and self.seabed is not None:
+            shallowest_m = self.seabed.depth_m - self.seabed.relief_m
+            if self.depth_m + CLEARANCE_M > shallowest_m:
+                raise ValueError(
+                    f"a seabed {shallowest_m:g} m deep must be {CLEARANCE_M:g} m below depth_m {self.depth_m:g}"
+                )
         return self
 
     @model_validator(mode="after")
@@ -257,6 +279,7 @@ NESTED = {
     "heading": HeadingSpec,
     "heading.faults": HeadingFaults,
     "imu_faults": ImuFaults,
+    "seabed": SeabedSpec,
     "prior": PriorSpec,
     "imu": ImuNoise,
     "imu_mounting": MountingSpec,

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .faults import arrives, mar, repeated
+from .janus import read_dvl
 from .log import DepthStream, DvlStream, GpsStream, HeadingStream, ReadingStream
 from .motion import Motion
 from .quantities import DEGREE
 from .random_streams import random_stream
 from .rig import Mounting
-from .scenario import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, Scenario, SensorSpec
+from .scenario import DepthSpec, GpsSpec, HeadingSpec, Scenario, SensorSpec
 from .state import Array, TimeArray
 
 Kind = TypeVar("Kind", bound=ReadingStream)
@@ -41,7 +42,7 @@ def read(kind: type[Kind], scenario: Scenario, seed: int, motion: Motion) -> Kin
     sensor, faults = kind.name, spec.faults
     t_ns = ticks(spec.rate_hz, scenario.duration_s)
     true_s = t_ns * 1e-9 - faults.clock_offset_s
-    z, error, sigma = READ[kind](spec, scenario.mountings[sensor], motion, true_s, random_stream(seed, sensor))
+    z, error, sigma = READ[kind](scenario, spec, scenario.mountings[sensor], motion, true_s, seed)
     z = mar(z + scenario.noise_scale * error, faults, sensor, seed)
     heard = np.isfinite(z).all(axis=1) & arrives(t_ns, faults, sensor, seed)
     rows = repeated(heard, faults, sensor, seed)
@@ -61,51 +62,36 @@ def _delays(spec: SensorSpec, sensor: str, heard: NDArray[np.bool_], seed: int) 
     return np.rint(way_s * 1e9).astype(np.int64)
 
 
-def janus_beams(beam_angle_rad: float) -> Array:
-    """Return the unit vectors (4, 3), in B, of beams at azimuths 45°, 135°, … and beam_angle_rad from straight down."""
-    azimuth = np.pi / 4 + np.pi / 2 * np.arange(4)
-    s, c = math.sin(beam_angle_rad), math.cos(beam_angle_rad)
-    return np.stack([s * np.cos(azimuth), s * np.sin(azimuth), np.full(4, -c)], axis=1)
-
-
 # Each reader returns what the sensor would say without noise (n, k), NaN where it hears nothing, its error (n, k), and
-# the standard deviation of the residual (m,).
-
-
-def _read_dvl(spec: DvlSpec, dvl: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
-    """v_WB_B by least squares from four beam velocities; (AᵀA)⁻¹ is diagonal, so the three errors are independent."""
-    R_WB, _, v_WB_W = motion.pose(t_s)
-    v_WD_B = np.einsum("nji,nj->ni", R_WB, v_WB_W)
-    if dvl.p_BS_B.any():
-        v_WD_B += np.cross(motion.attitude(t_s)[1], dvl.p_BS_B)
-    A = janus_beams(spec.beam_angle_deg * DEGREE)
-    beam_error = spec.beam_sigma_mps * rng.standard_normal((len(t_s), 4))
-    sigma = spec.beam_sigma_mps * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
-    return spec.faults.scale * v_WD_B @ dvl.R_BS, beam_error @ np.linalg.pinv(A).T, sigma
+# its sigma, (k,) or (n, k).
 
 
 def _read_depth(
-    spec: DepthSpec, depth: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator
-) -> tuple[Array, ...]:
+    scenario: Scenario, spec: DepthSpec, depth: Mounting, motion: Motion, t_s: Array, seed: int
+) -> tuple[Array, Array, Array]:
     z_m = spec.faults.scale * _point(motion, depth, t_s)[:, 2:]
-    return z_m, spec.sigma_m * rng.standard_normal((len(t_s), 1)), np.array([spec.sigma_m])
+    sigma = np.array([spec.sigma_m])
+    return z_m, sigma * random_stream(seed, "depth").standard_normal((len(t_s), 1)), sigma
 
 
-def _read_gps(spec: GpsSpec, gps: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator) -> tuple[Array, ...]:
+def _read_gps(
+    scenario: Scenario, spec: GpsSpec, gps: Mounting, motion: Motion, t_s: Array, seed: int
+) -> tuple[Array, Array, Array]:
     p_WG_W = _point(motion, gps, t_s)
     sigma = np.array([spec.horizontal_sigma_m, spec.horizontal_sigma_m, spec.vertical_sigma_m])
     afloat = p_WG_W[:, 2:] > ANTENNA_AWASH_M
-    return np.where(afloat, p_WG_W, np.nan), sigma * rng.standard_normal((len(t_s), 3)), sigma
+    error = sigma * random_stream(seed, "gps").standard_normal((len(t_s), 3))
+    return np.where(afloat, p_WG_W, np.nan), error, sigma
 
 
 def _read_heading(
-    spec: HeadingSpec, heading: Mounting, motion: Motion, t_s: Array, rng: np.random.Generator
-) -> tuple[Array, ...]:
+    scenario: Scenario, spec: HeadingSpec, heading: Mounting, motion: Motion, t_s: Array, seed: int
+) -> tuple[Array, Array, Array]:
     R_WB, _, _ = motion.pose(t_s)
     x_H_W = R_WB @ heading.R_BS[:, 0]
     psi = np.arctan2(x_H_W[:, 1:2], x_H_W[:, :1]) + spec.bias_deg * DEGREE
     sigma = np.array([spec.sigma_deg * DEGREE])
-    return psi, sigma * rng.standard_normal((len(t_s), 1)), sigma
+    return psi, sigma * random_stream(seed, "heading").standard_normal((len(t_s), 1)), sigma
 
 
 def _point(motion: Motion, mounting: Mounting, t_s: Array) -> Array:
@@ -114,8 +100,8 @@ def _point(motion: Motion, mounting: Mounting, t_s: Array) -> Array:
     return p_WB_W + R_WB @ mounting.p_BS_B
 
 
-READ: dict[type[ReadingStream], Callable[..., tuple[Array, ...]]] = {
-    DvlStream: _read_dvl,
+READ: dict[type[ReadingStream], Callable[..., tuple[Array, Array, Array]]] = {
+    DvlStream: read_dvl,
     DepthStream: _read_depth,
     GpsStream: _read_gps,
     HeadingStream: _read_heading,

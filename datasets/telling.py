@@ -7,10 +7,27 @@ from typing import Any
 
 from .scenario import SENSORS, Scenario
 
+TOLD = {"max_tilt_deg", "beam_loss_probability", "three_beams", "bias_deg"}
+"""Dials of sensors that neither the rig nor the readings show."""
+
 
 def told(scenario: Scenario) -> list[str]:
-    """Return a sentence on each sensor that comes late, and one on each that has faults, with every dial's name."""
-    return [*_late(scenario), *_faults(scenario)]
+    """Return a sentence on the world, on each sensor's dials, delays and faults, where there is anything to say."""
+    return [*_world(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
+
+
+def _world(scenario: Scenario) -> list[str]:
+    return [
+        f"{name}: {listed(dataclasses.asdict(part))}."
+        for name in ("seabed",)
+        if (part := getattr(scenario, name)) is not None
+    ]
+
+
+def _sensors(scenario: Scenario) -> list[str]:
+    specs = {sensor: getattr(scenario, sensor) for sensor in SENSORS}
+    dials = {s: {n: v for n, v in changed(spec).items() if n in TOLD} for s, spec in specs.items() if spec is not None}
+    return [f"{sensor}: {listed(values)}." for sensor, values in dials.items() if values]
 
 
 def _late(scenario: Scenario) -> list[str]:

@@ -12,7 +12,6 @@ from fathom.datasets.inertial import simulate_biases, simulate_white_noise
 from fathom.datasets.mission import MISSIONS, fly
 from fathom.datasets.random_streams import RANDOM_STREAMS, random_stream
 from fathom.datasets.scenario import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, MountingSpec, PriorSpec, Scenario
-from fathom.datasets.sensors import janus_beams
 from fathom.datasets.simulator import simulate
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -179,13 +178,6 @@ def test_dvl_sigma_is_that_of_its_beams():
         assert_variance(error[:, axis], log.dvl.sigma[0, axis])
     correlation = np.corrcoef(error.T) - np.eye(3)
     assert np.abs(correlation).max() < 4 / np.sqrt(len(error))
-
-
-def test_beams_look_down_and_around():
-    A = janus_beams(np.radians(22.5))
-    np.testing.assert_allclose(np.linalg.norm(A, axis=1), 1)
-    np.testing.assert_allclose(A[:, 2], -np.cos(np.radians(22.5)))
-    np.testing.assert_allclose(A.sum(axis=0)[:2], 0, atol=1e-15)
 
 
 def test_readings_have_the_sigmas_they_state():
