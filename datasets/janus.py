@@ -28,8 +28,8 @@ def read_dvl(
     """Return v_WD_D (n, 3) where there is bottom lock and NaN elsewhere, its error (n, 3), and its sigma (n, 3).
 
     The velocity is the least-squares solution of its beams, and its sigma their figure of merit: the square roots of
-    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors correlated by
-    ±1/2 between each two axes, which no reading has a place for: each axis is told rightly, their correlation is not.
+    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors of which
+    each two are correlated by ±1/2; a reading has no place for that: its sigmas are right, axis by axis, and no more.
     """
     R_WB, p_WB_W, v_WB_W = motion.pose(t_s)
     v_WD_B = np.einsum("nji,nj->ni", R_WB, v_WB_W)

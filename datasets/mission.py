@@ -13,11 +13,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from .errors import DatasetError
 from .motion import AFLOAT_M, Motion
 from .random_streams import random_stream
 from .recorded_path import follow
+from .sea import Sea
 from .state import Array
 
 if TYPE_CHECKING:
@@ -70,11 +72,11 @@ def fly(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Motion
         return follow(scenario, path)
     if path is not None:
         raise DatasetError(f"simulate: mission {scenario.mission} takes no path; only mission {RECORDED!r} follows one")
-    return draw(scenario, random_stream(seed, "mission"))
+    return draw(scenario, random_stream(seed, "mission"), Sea.of(scenario, seed))
 
 
-def draw(scenario: Scenario, rng: np.random.Generator) -> Motion:
-    """Return the motion of one of MISSIONS; rng draws the phases of the wobble."""
+def draw(scenario: Scenario, rng: np.random.Generator, sea: Sea | None = None) -> Motion:
+    """Return the motion of one of MISSIONS, on a sea or a flat one; rng draws the phases of the wobble."""
     plan = MISSIONS[scenario.mission]
     t_s = np.arange(-MARGIN_S, scenario.duration_s + MARGIN_S, KNOT_S)
     rock = wobble(t_s, rng)
@@ -89,7 +91,21 @@ def draw(scenario: Scenario, rng: np.random.Generator) -> Motion:
     v_WB_W = np.stack([horizontal * np.cos(course), horizontal * np.sin(course), vertical], axis=1)
     angles = np.stack([-bank, -np.arcsin(vertical / speed), course], axis=1)
     angles += math.radians(scenario.wobble_deg) * rock[:, :3]
-    return Motion.from_velocity(t_s, v_WB_W, angles, np.array([0.0, 0.0, AFLOAT_M]))
+    p_0 = np.array([0.0, 0.0, AFLOAT_M])
+    if sea is not None:
+        p_WB_W = np.cumsum(v_WB_W, axis=0) * KNOT_S
+        p_WB_W += p_0 - [np.interp(0.0, t_s, column) for column in p_WB_W.T]
+        moved = make_interp_spline(t_s, sea.displacement(t_s, p_WB_W), k=5)
+        p_0, v_WB_W = p_0 + moved(0.0), v_WB_W + moved.derivative()(t_s)
+        angles += lean(sea.slope(t_s, p_WB_W), angles[:, 2])
+    return Motion.from_velocity(t_s, v_WB_W, angles, p_0)
+
+
+def lean(slope: Array, psi: Array) -> Array:
+    """Return by which angles (n, 3) a body leans that lies on a slope (n, 2) with its nose towards psi (n,)."""
+    ahead = slope[:, 0] * np.cos(psi) + slope[:, 1] * np.sin(psi)
+    left = -slope[:, 0] * np.sin(psi) + slope[:, 1] * np.cos(psi)
+    return np.stack([np.arctan(left), -np.arctan(ahead), np.zeros(len(psi))], axis=1)
 
 
 def depth_profile(scenario: Scenario, plan: Plan, t_s: Array) -> Array:

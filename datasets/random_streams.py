@@ -33,6 +33,7 @@ RANDOM_STREAMS = {
     "gps_repeats": 25,
     "heading_repeats": 26,
     "dvl_beams": 27,
+    "waves": 28,
 }
 """Apart, so that dropping one changes no other. Never renumber."""
 

@@ -18,6 +18,7 @@ from .imu_grades import IMU_GRADES
 from .mission import MISSIONS, RECORDED
 from .quantities import STRICT, Finite, NotNegative, Positive, Probability, Vector
 from .rig import ImuNoise, Mounting, Rig
+from .sea import TideSpec, WavesSpec
 from .seabed import SeabedSpec
 
 Imu = Annotated[
@@ -74,6 +75,7 @@ class GpsSpec:
     rate_hz: Positive = 1.0
     horizontal_sigma_m: Positive = 1.5
     vertical_sigma_m: Positive = 3.0
+    reacquisition_s: NotNegative = 0.0  # from when the antenna leaves the water to the first fix; it begins with one
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
     faults: GpsFaults = GpsFaults()
@@ -81,11 +83,16 @@ class GpsSpec:
 
 @dataclass(frozen=True, config=STRICT)
 class HeadingSpec:
-    """Magnetic heading, 1–2° after calibration; the bias is a dial that no estimator is told of."""
+    """Magnetic heading, 1–2° after calibration. No estimator is told of its bias, nor of soft iron.
+
+    Soft iron adds soft_iron_deg · sin 2(ψ − soft_iron_axis_deg): the quadrantal deviation of a compass.
+    """
 
     rate_hz: Positive = 5.0
     sigma_deg: Positive = 1.0
     bias_deg: Finite = 0.0
+    soft_iron_deg: NotNegative = 0.0
+    soft_iron_axis_deg: Finite = 0.0
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
     faults: HeadingFaults = HeadingFaults()
@@ -141,6 +148,8 @@ class Scenario:
 
     # the world
     seabed: SeabedSpec | None = None  # None: always within the DVL's range
+    waves: WavesSpec | None = None  # they move every mission but a recorded one, which has its own in it
+    tide: TideSpec | None = None
 
     # the vehicle
     gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
@@ -280,6 +289,8 @@ NESTED = {
     "heading.faults": HeadingFaults,
     "imu_faults": ImuFaults,
     "seabed": SeabedSpec,
+    "waves": WavesSpec,
+    "tide": TideSpec,
     "prior": PriorSpec,
     "imu": ImuNoise,
     "imu_mounting": MountingSpec,

@@ -17,12 +17,15 @@ from .quantities import DEGREE
 from .random_streams import random_stream
 from .rig import Mounting
 from .scenario import DepthSpec, GpsSpec, HeadingSpec, Scenario, SensorSpec
+from .sea import Sea
 from .state import Array, TimeArray
 
 Kind = TypeVar("Kind", bound=ReadingStream)
 
 ANTENNA_AWASH_M = -0.05
 """The antenna hears GPS while it is higher than this; a little water over it does not yet drown the signal."""
+WATCH_S = 0.1
+"""How often a receiver that must reacquire looks whether its antenna is awash."""
 
 
 def ticks(rate_hz: float, duration_s: float) -> TimeArray:
@@ -69,19 +72,31 @@ def _delays(spec: SensorSpec, sensor: str, heard: NDArray[np.bool_], seed: int) 
 def _read_depth(
     scenario: Scenario, spec: DepthSpec, depth: Mounting, motion: Motion, t_s: Array, seed: int
 ) -> tuple[Array, Array, Array]:
-    z_m = spec.faults.scale * _point(motion, depth, t_s)[:, 2:]
+    p_WP_W, sea = _point(motion, depth, t_s), Sea.of(scenario, seed)
+    depth_m = -p_WP_W[:, 2:] if sea is None else sea.rise_m(t_s, p_WP_W)[:, None] - p_WP_W[:, 2:]
     sigma = np.array([spec.sigma_m])
-    return z_m, sigma * random_stream(seed, "depth").standard_normal((len(t_s), 1)), sigma
+    return -spec.faults.scale * depth_m, sigma * random_stream(seed, "depth").standard_normal((len(t_s), 1)), sigma
 
 
 def _read_gps(
     scenario: Scenario, spec: GpsSpec, gps: Mounting, motion: Motion, t_s: Array, seed: int
 ) -> tuple[Array, Array, Array]:
     p_WG_W = _point(motion, gps, t_s)
+    heard = _afloat(scenario, gps, motion, t_s, seed)
+    if spec.reacquisition_s:
+        before_s = np.arange(0.0, scenario.duration_s + WATCH_S, WATCH_S)
+        awash_s = np.concatenate([[-np.inf], before_s[~_afloat(scenario, gps, motion, before_s, seed)]])
+        heard &= t_s - awash_s[np.searchsorted(awash_s, t_s, side="right") - 1] >= spec.reacquisition_s
     sigma = np.array([spec.horizontal_sigma_m, spec.horizontal_sigma_m, spec.vertical_sigma_m])
-    afloat = p_WG_W[:, 2:] > ANTENNA_AWASH_M
     error = sigma * random_stream(seed, "gps").standard_normal((len(t_s), 3))
-    return np.where(afloat, p_WG_W, np.nan), error, sigma
+    return np.where(heard[:, None], p_WG_W, np.nan), error, sigma
+
+
+def _afloat(scenario: Scenario, gps: Mounting, motion: Motion, t_s: Array, seed: int) -> NDArray[np.bool_]:
+    """Return when (n,) the antenna is out of the water."""
+    p_WG_W, sea = _point(motion, gps, t_s), Sea.of(scenario, seed)
+    above_m = p_WG_W[:, 2] if sea is None else p_WG_W[:, 2] - sea.rise_m(t_s, p_WG_W * [1, 1, 0])
+    return above_m > ANTENNA_AWASH_M
 
 
 def _read_heading(
@@ -89,7 +104,10 @@ def _read_heading(
 ) -> tuple[Array, Array, Array]:
     R_WB, _, _ = motion.pose(t_s)
     x_H_W = R_WB @ heading.R_BS[:, 0]
-    psi = np.arctan2(x_H_W[:, 1:2], x_H_W[:, :1]) + spec.bias_deg * DEGREE
+    psi = np.arctan2(x_H_W[:, 1:2], x_H_W[:, :1])
+    if spec.soft_iron_deg:
+        psi += spec.soft_iron_deg * DEGREE * np.sin(2 * (psi - spec.soft_iron_axis_deg * DEGREE))
+    psi += spec.bias_deg * DEGREE
     sigma = np.array([spec.sigma_deg * DEGREE])
     return psi, sigma * random_stream(seed, "heading").standard_normal((len(t_s), 1)), sigma
 

@@ -7,7 +7,10 @@ from typing import Any
 
 from .scenario import SENSORS, Scenario
 
-TOLD = {"max_tilt_deg", "beam_loss_probability", "three_beams", "bias_deg"}
+TOLD = {
+    *("max_tilt_deg", "beam_loss_probability", "three_beams"),
+    *("reacquisition_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg"),
+}
 """Dials of sensors that neither the rig nor the readings show."""
 
 
@@ -19,7 +22,7 @@ def told(scenario: Scenario) -> list[str]:
 def _world(scenario: Scenario) -> list[str]:
     return [
         f"{name}: {listed(dataclasses.asdict(part))}."
-        for name in ("seabed",)
+        for name in ("seabed", "waves", "tide")
         if (part := getattr(scenario, name)) is not None
     ]
 
