@@ -16,10 +16,11 @@ from .errors import DatasetError, nearest
 from .faults import AnyFaults, DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults, true_mounting
 from .imu_grades import IMU_GRADES
 from .mission import MISSIONS, RECORDED
-from .quantities import STRICT, Finite, NotNegative, Positive, Probability, Vector
+from .quantities import DEGREE, STRICT, Finite, NotNegative, Positive, Probability, Vector
 from .rig import ImuNoise, Mounting, Rig
 from .sea import TideSpec, WavesSpec
 from .seabed import SeabedSpec
+from .state import Array
 
 Imu = Annotated[
     Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
@@ -98,6 +99,8 @@ class HeadingSpec:
     faults: HeadingFaults = HeadingFaults()
 
 
+EARTH_RATE_RADPS = 7.292115e-5
+"""WGS 84: 15.04 °/h."""
 CLEARANCE_M = 0.5
 """Least height of a mission's deepest point above the seabed."""
 
@@ -147,6 +150,7 @@ class Scenario:
     path_spacing_s: Positive | None = None  # between the knots of smoothing splines; None: through every pose
 
     # the world
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None  # where the Earth turns; None: it does not
     seabed: SeabedSpec | None = None  # None: always within the DVL's range
     waves: WavesSpec | None = None  # they move every mission but a recorded one, which has its own in it
     tide: TideSpec | None = None
@@ -160,6 +164,7 @@ class Scenario:
 
     # the sensors
     imu_rate_hz: Positive = 100.0
+    imu_bias_correlation_s: Positive | None = None  # of Gauss–Markov biases; None: they walk
     imu_faults: ImuFaults = ImuFaults()
     dvl: DvlSpec | None = DvlSpec()
     depth: DepthSpec | None = DepthSpec()
@@ -257,6 +262,14 @@ class Scenario:
     def imu_noise(self) -> ImuNoise:
         """The figures behind `imu`."""
         return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
+
+    @property
+    def earth_rate_radps(self) -> Array:
+        """Angular rate of the Earth, (3,) in W axes; zero where it does not turn."""
+        if self.latitude_deg is None:
+            return np.zeros(3)
+        latitude = self.latitude_deg * DEGREE
+        return EARTH_RATE_RADPS * np.array([0.0, math.cos(latitude), math.sin(latitude)])
 
     @property
     def rig(self) -> Rig:

@@ -32,10 +32,11 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         raise DatasetError(f"simulate: seed must not be negative, found {seed}")
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
     edges_ns = np.concatenate([[0], ticks(scenario.imu_rate_hz, scenario.duration_s)])
-    biases = simulate_biases(rig.imu_noise, edges_ns, seed) * scenario.noise_scale
+    biases = simulate_biases(rig.imu_noise, edges_ns, seed, scenario.imu_bias_correlation_s) * scenario.noise_scale
 
     R_WB, p_WB_W, v_WB_W = motion.pose(edges_ns * 1e-9)
     truth = Trajectory(start_ns + edges_ns, R_WB, p_WB_W, v_WB_W, b_a=biases[:, :3], b_g=biases[:, 3:])
+    earth = "the Earth does not turn" if scenario.latitude_deg is None else f"latitude {scenario.latitude_deg:g}°"
     grade = scenario.imu if isinstance(scenario.imu, str) else "custom"
     return Log(
         name=f"{scenario.mission}-{grade}-s{seed}",
@@ -49,10 +50,11 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         prior=draw_prior(scenario, truth, seed),
         notes=(
             f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu_rate_hz:g} Hz, "
-            f"seed {seed}, noise scaled by {scenario.noise_scale:g}; the Earth does not turn.",
+            f"seed {seed}, noise scaled by {scenario.noise_scale:g}; {earth}.",
             *motion.notes,
             *told(scenario),
         ),
+        origin=None if scenario.latitude_deg is None else (scenario.latitude_deg, 0.0),
     )
 
 

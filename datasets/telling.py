@@ -16,7 +16,7 @@ TOLD = {
 
 def told(scenario: Scenario) -> list[str]:
     """Return a sentence on the world, on each sensor's dials, delays and faults, where there is anything to say."""
-    return [*_world(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
+    return [*_world(scenario), *_biases(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
 
 
 def _world(scenario: Scenario) -> list[str]:
@@ -25,6 +25,11 @@ def _world(scenario: Scenario) -> list[str]:
         for name in ("seabed", "waves", "tide")
         if (part := getattr(scenario, name)) is not None
     ]
+
+
+def _biases(scenario: Scenario) -> list[str]:
+    correlation_s = scenario.imu_bias_correlation_s
+    return [] if correlation_s is None else [f"imu biases: Gauss–Markov, correlated over {correlation_s:g} s."]
 
 
 def _sensors(scenario: Scenario) -> list[str]:
