@@ -103,12 +103,12 @@ class Sea:
         """Return how far the water is, (n, 3) m, from where it would be in a flat sea, p_W (n, 3)."""
         height, phase, _ = self._waves(t_s, p_W)
         along = -np.sum(height * np.sin(phase), axis=1)
-        return np.column_stack([np.outer(along, self.direction), self.rise_m(t_s, p_W)])
+        return np.column_stack([along[:, None] * self.direction, self.rise_m(t_s, p_W)])
 
     def slope(self, t_s: Array, p_W: Array) -> Array:
         """Return the slope of the surfaces of equal pressure, (n, 2): the derivative of rise_m by x and y."""
         height, phase, wavenumber = self._waves(t_s, p_W)
-        return np.outer(-np.sum(wavenumber * height * np.sin(phase), axis=1), self.direction)
+        return -np.sum(wavenumber * height * np.sin(phase), axis=1)[:, None] * self.direction
 
     def tide_m(self, t_s: Array) -> Array:
         """Return how far the tide has risen since the start, (n,)."""

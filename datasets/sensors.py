@@ -84,8 +84,8 @@ def _read_gps(
     p_WG_W = _point(motion, gps, t_s)
     heard = _afloat(scenario, gps, motion, t_s, seed)
     if spec.reacquisition_s:
-        before_s = np.arange(0.0, scenario.duration_s + WATCH_S, WATCH_S)
-        awash_s = np.concatenate([[-np.inf], before_s[~_afloat(scenario, gps, motion, before_s, seed)]])
+        watch_s = np.arange(*scenario.reach_s, WATCH_S)
+        awash_s = np.concatenate([[-np.inf], watch_s[~_afloat(scenario, gps, motion, watch_s, seed)]])
         heard &= t_s - awash_s[np.searchsorted(awash_s, t_s, side="right") - 1] >= spec.reacquisition_s
     sigma = np.array([spec.horizontal_sigma_m, spec.horizontal_sigma_m, spec.vertical_sigma_m])
     error = sigma * random_stream(seed, "gps").standard_normal((len(t_s), 3))

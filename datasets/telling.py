@@ -8,7 +8,7 @@ from typing import Any
 from .scenario import SENSORS, Scenario
 
 TOLD = {
-    *("max_tilt_deg", "beam_loss_probability", "three_beams"),
+    *("min_range_m", "max_range_m", "max_tilt_deg", "beam_loss_probability", "three_beams"),
     *("reacquisition_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg"),
 }
 """Dials of sensors that neither the rig nor the readings show."""
