@@ -229,5 +229,4 @@ def repeated(heard: NDArray[np.bool_], faults: AnyFaults, sensor: str, seed: int
     if not (faults.repeat_probability and len(rows)):
         return rows
     fresh = random_stream(seed, f"{sensor}_repeats").random(len(heard))[rows] >= faults.repeat_probability
-    fresh[0] = True
     return rows[np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), 0))]

@@ -172,6 +172,24 @@ def test_reception_is_by_the_right_clock():
     assert (log.dvl.received_ns - log.dvl.t_ns == 300_000_000).all()
 
 
+@pytest.mark.parametrize("sensor", ["imu", *SENSORS])
+def test_faults_befall_readings_independently_of_one_another(sensor):
+    """Each has a stream of its own: were two to share one, the same readings would be hit."""
+    p, (all_ns, all_z) = 0.3, imu_and(clean(), sensor)
+    (left_ns, _), (_, spoilt), (_, stale) = (
+        imu_and(with_faults(sensor, **{f"{fault}_probability": p}), sensor)
+        for fault in ("dropout", "outlier", "repeat")
+    )
+    hit = {
+        "dropout": ~np.isin(all_ns, left_ns),
+        "outlier": (spoilt != all_z).any(axis=1),
+        "repeat": (np.diff(stale, axis=0, prepend=0) == 0).all(axis=1),
+    }
+    for one, other in (("dropout", "outlier"), ("dropout", "repeat"), ("outlier", "repeat")):
+        low, high = binom.interval(0.9999, len(hit[one]), p**2)
+        assert low <= (hit[one] & hit[other]).sum() <= high, (one, other)
+
+
 # -- where sensors really are
 
 

@@ -5,8 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from fathom.datasets import DatasetError, ImuNoise, Log
+from fathom.datasets import DatasetError, ImuNoise, Log, open_log
 from fathom.datasets.epochs import cut
+from fathom.datasets.folder import write_folder
 from fathom.datasets.imu_grades import IMU_GRADES
 from fathom.datasets.inertial import simulate_biases
 from fathom.datasets.mission import MISSIONS
@@ -165,6 +166,32 @@ def test_same_seed_same_log_and_other_seed_other_log():
     assert_same(one, again)
     changed = {name for name in one if not np.array_equal(one[name], other[name])}
     assert {"imu.w", "imu.f", "dvl.z", "depth.z", "gps.z", "heading.z", "truth.p_WB_W", "prior.p_WB_W"} <= changed
+
+
+EVERYTHING = {
+    "mission": "helix",
+    "duration_s": 90,
+    "latitude_deg": -33.0,
+    "waves": {"height_m": 0.8},
+    "tide": {},
+    "seabed": {"relief_m": 2},
+    "imu_bias_correlation_s": 100,
+    "imu_faults": {"dropout_probability": 0.01, "outlier_probability": 0.01, "gyro_quantum_dps": 0.01},
+    "dvl": {"beam_loss_probability": 0.1, "max_tilt_deg": 15, "delay_s": 0.2, "faults": {"repeat_probability": 0.1}},
+    "gps": {"reacquisition_s": 5, "faults": {"outages_s": [[3, 6]]}},
+    "heading": {"soft_iron_deg": 2, "disorder_s": 1, "faults": {"clock_offset_s": 0.05}},
+}
+
+
+def test_a_log_with_everything_in_it_is_fixed_by_its_seed_can_be_cut_and_survives_a_folder(tmp_path):
+    scenario = Scenario.from_dict(EVERYTHING)
+    log = simulate(scenario, 5)
+    assert_same(arrays(log), arrays(simulate(Scenario.from_dict(json.loads(json.dumps(scenario.to_dict()))), 5)))
+    assert cut(log).failure is None
+    back = open_log(write_folder(log, tmp_path / "log"))
+    assert_same(arrays(log), arrays(back))
+    assert back.notes[: len(log.notes)] == log.notes
+    assert back.origin == (-33.0, 0.0)
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
