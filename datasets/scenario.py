@@ -22,6 +22,11 @@ from .sea import TideSpec, WavesSpec
 from .seabed import SeabedSpec
 from .state import Array
 
+EARTH_RATE_RADPS = 7.292115e-5
+"""WGS 84: 15.04 °/h."""
+CLEARANCE_M = 0.5
+"""Least height of a mission's deepest point above the seabed."""
+
 Imu = Annotated[
     Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
     Discriminator(lambda imu: "grade" if isinstance(imu, str) else "figures"),
@@ -98,11 +103,6 @@ class HeadingSpec:
     disorder_s: NotNegative = 0.0
     faults: HeadingFaults = HeadingFaults()
 
-
-EARTH_RATE_RADPS = 7.292115e-5
-"""WGS 84: 15.04 °/h."""
-CLEARANCE_M = 0.5
-"""Least height of a mission's deepest point above the seabed."""
 
 SensorSpec = DvlSpec | DepthSpec | GpsSpec | HeadingSpec
 SENSORS = ("dvl", "depth", "gps", "heading")
@@ -197,6 +197,14 @@ class Scenario:
     def _saw_has_teeth(self) -> Scenario:
         if self.mission in MISSIONS and MISSIONS[self.mission].sawtooth and self.shallow_m >= self.depth_m:
             raise ValueError(f"{self.mission}: shallow_m {self.shallow_m} must be less than depth_m {self.depth_m}")
+        return self
+
+    @model_validator(mode="after")
+    def _helix_climbs_gently(self) -> Scenario:
+        if self.mission == "helix" and self.helix_pitch_m > 2 * math.pi * self.turn_radius_m:
+            raise ValueError(
+                f"helix: helix_pitch_m {self.helix_pitch_m:g} climbs at more than 45°; at most 2π · turn_radius_m"
+            )
         return self
 
     @model_validator(mode="after")

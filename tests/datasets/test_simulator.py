@@ -287,6 +287,7 @@ def test_scenario_survives_a_file():
         ({"imu": {"gyro_densty": 1e-4}}, ["imu.gyro_densty", "did you mean 'gyro_density'"]),
         ({"imu": 3}, ["imu"]),
         ({"mission": "yo-yo", "depth_m": 3}, ["shallow_m", "less than"]),
+        ({"mission": "helix", "helix_pitch_m": 70}, ["helix_pitch_m 70", "45°"]),
         ([1, 2], ["mapping"]),
     ],
 )
