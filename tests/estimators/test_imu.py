@@ -210,7 +210,10 @@ def test_process_noise_is_symmetric_and_sandwich_is_f_p_f_transposed() -> None:
     assert np.linalg.eigvalsh(Q).min() > -1e-18
 
 
-@pytest.mark.parametrize("mission", ["lawnmower", "yo-yo"])
+@pytest.mark.parametrize(
+    "mission",
+    ["lawnmower", "yo-yo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("helix", "box", "transit"))],
+)
 def test_ten_noise_free_minutes_return_to_the_truth(mission: str) -> None:
     """The simulator's IMU, at its lever arm and turned mounting, through the block: within 5 mm all the way."""
     log = simulate(Scenario(mission=mission, duration_s=600.0, noise_scale=0.0), seed=1)
