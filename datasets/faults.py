@@ -53,7 +53,6 @@ class Faults:
         repeat_probability: of each reading, to say again what the one before it said, at its own time.
         clock_offset_s: readings are stamped this much later than they were true; reception is by the right clock, but
             never before the stamp.
-        lever_arm_error_m: where the sensor really is, less where the rig says, in B.
     """
 
     dropout_probability: Probability = 0.0
@@ -61,7 +60,6 @@ class Faults:
     outlier_probability: Probability = 0.0
     repeat_probability: Probability = 0.0
     clock_offset_s: ClockOffset = 0.0
-    lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -71,6 +69,7 @@ class DvlFaults(Faults):
     Attributes:
         scale: of the velocity it reads to the true one: a wrong speed of sound.
         misalignment_deg: roll, pitch and yaw of its true axes in B, which the rig says are B's.
+        lever_arm_error_m: where it really is, in B; the rig says at its origin.
         limit_mps: what no component of a reading exceeds.
         quantum_mps: to the nearest multiple of which each component is rounded.
     """
@@ -78,6 +77,7 @@ class DvlFaults(Faults):
     outlier_mps: NotNegative = 1.0
     scale: Positive = 1.0
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
+    lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
     limit_mps: Positive | None = None
     quantum_mps: NotNegative = 0.0
 
@@ -93,12 +93,14 @@ class DepthFaults(Faults):
 
     Attributes:
         scale: of the depth it reads to the true one: a wrong density of the water.
+        lever_arm_error_m: where it really is, less where the rig says, in B.
         limit_m: the depth at which it saturates.
         quantum_m: its resolution.
     """
 
     outlier_m: NotNegative = 5.0
     scale: Positive = 1.0
+    lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
     limit_m: Positive | None = None
     quantum_m: NotNegative = 0.0
 
@@ -110,9 +112,15 @@ class DepthFaults(Faults):
 
 @dataclass(frozen=True, config=STRICT)
 class GpsFaults(Faults):
-    """Of a GPS receiver: quantum_m is what each coordinate is rounded to."""
+    """Of a GPS receiver.
+
+    Attributes:
+        lever_arm_error_m: where its antenna really is, less where the rig says, in B.
+        quantum_m: to the nearest multiple of which each coordinate is rounded.
+    """
 
     outlier_m: NotNegative = 50.0
+    lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
     quantum_m: NotNegative = 0.0
 
     @property
@@ -147,6 +155,7 @@ class ImuFaults(Faults):
     Attributes:
         gyro_scale, accel_scale: of what each axis reads to the truth, before bias and noise.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
+        lever_arm_error_m: where it really is, less where the rig says, in B.
         gyro_limit_dps, accel_limit_mps2: where a sample saturates; it is the mean over an interval that is clipped.
         gyro_quantum_dps, accel_quantum_mps2: to the nearest multiple of which a sample is rounded.
     """
@@ -156,6 +165,7 @@ class ImuFaults(Faults):
     gyro_scale: Vector = (1.0, 1.0, 1.0)
     accel_scale: Vector = (1.0, 1.0, 1.0)
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
+    lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
     gyro_limit_dps: Positive | None = None
     accel_limit_mps2: Positive | None = None
     gyro_quantum_dps: NotNegative = 0.0
@@ -190,10 +200,9 @@ def _none_is_infinite(limit: float | None) -> float:
 def true_mounting(stated: Mounting, faults: AnyFaults) -> Mounting:
     """Return where a sensor really sits, for where the rig says: R_BS turned in its own axes, p_BS_B shifted."""
     R_BS, p_BS_B = stated.R_BS, stated.p_BS_B
-    misalignment_deg = getattr(faults, "misalignment_deg", (0.0, 0.0, 0.0))
-    if any(misalignment_deg):
-        R_BS = R_BS @ Rotation.from_euler("xyz", misalignment_deg, degrees=True).as_matrix()
-    if any(faults.lever_arm_error_m):
+    if not isinstance(faults, DepthFaults | GpsFaults) and any(faults.misalignment_deg):
+        R_BS = R_BS @ Rotation.from_euler("xyz", faults.misalignment_deg, degrees=True).as_matrix()
+    if not isinstance(faults, HeadingFaults) and any(faults.lever_arm_error_m):
         p_BS_B = p_BS_B + faults.lever_arm_error_m
     return Mounting(R_BS, p_BS_B)
 

@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from fathom.datasets import DatasetError, ImuNoise, Log, open_log
 from fathom.datasets.epochs import cut
 from fathom.datasets.folder import write_folder
@@ -13,6 +15,8 @@ from fathom.datasets.inertial import simulate_biases
 from fathom.datasets.mission import MISSIONS
 from fathom.datasets.random_streams import RANDOM_STREAMS, random_stream
 from fathom.datasets.scenario import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, MountingSpec, PriorSpec, Scenario
+from fathom.datasets.sea import TideSpec, WavesSpec
+from fathom.datasets.seabed import SeabedSpec
 from fathom.datasets.simulator import simulate
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
@@ -269,6 +273,19 @@ def test_scenario_survives_a_file():
     )
     assert Scenario.from_dict(json.loads(json.dumps(scenario.to_dict()))) == scenario
     assert Scenario.from_dict({}) == Scenario()
+
+
+def keys(value: object) -> object:
+    """The keys of nested mappings, all the way down."""
+    return {key: keys(item) for key, item in value.items()} if isinstance(value, dict) else None
+
+
+def test_the_page_on_the_simulator_shows_every_dial_at_its_default():
+    page = Path(__file__).parents[2].joinpath("docs", "simulator.md").read_text(encoding="utf-8")
+    shown = yaml.safe_load(page.split("```yaml")[1].split("```")[0])
+    scenario = Scenario.from_dict(shown)
+    assert keys(shown) == keys(scenario.to_dict())
+    assert scenario == Scenario(seabed=SeabedSpec(), waves=WavesSpec(), tide=TideSpec())
 
 
 @pytest.mark.parametrize(
