@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -70,7 +70,7 @@ def logarithmic(axes: Axes, which: str) -> None:
         axis.set_minor_locator(NullLocator())
 
 
-def handle(label: str, marker: str, colour: str, filled: bool, line: str = "none") -> Line2D:
+def handle(label: str, marker: str, colour: str, filled: bool, line: Literal["none", "-", "--"] = "none") -> Line2D:
     """Return what stands for an estimator in a legend."""
     face = colour if filled else "white"
     return Line2D([], [], marker=marker, color=colour, markerfacecolor=face, linestyle=line, label=label)

@@ -119,8 +119,8 @@ def _over_floor(done: Sequence[Record]) -> Record:
     record: Record = {}
     for block, (score, floor) in OVER.items():
         known = [row for row in done if row[score] is not None and row[floor] is not None]
-        of = [np.array([row[name] ** 2 for row in known]) for name in (score, floor)]
-        ratio = rmse_over_floor(*of) if known else None
+        squared_error, bound = (np.array([row[name] ** 2 for row in known]) for name in (score, floor))
+        ratio = rmse_over_floor(squared_error, bound) if known else None
         for part in ("ratio", "low", "high"):
             name = f"over_floor_{block}" if part == "ratio" else f"over_floor_{block}_{part}"
             record[name] = None if ratio is None else getattr(ratio, part)
