@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import yaml
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from ..datasets.errors import nearest
@@ -25,6 +25,10 @@ from .run import Scoring
 
 STRICT = ConfigDict(extra="forbid", populate_by_name=True)
 SHIPPED = Path(__file__).parent / "experiments"
+
+
+MOST_SEEDS = 100_000
+"""A larger number of seeds is a seed that lacks its brackets."""
 
 
 class ExperimentError(ValueError):
@@ -127,6 +131,15 @@ class EstimatorSpec:
         return create(self.name, **self.options)
 
 
+def _counted_from_one(seeds: Any) -> Any:
+    """Return the seeds that a number of them stands for; a list as it is."""
+    if isinstance(seeds, list | tuple):
+        return seeds
+    if type(seeds) is not int or not 1 <= seeds <= MOST_SEEDS:
+        raise ValueError(f"expected a list of seeds, or how many (1 to {MOST_SEEDS}), found {seeds!r:.60}")
+    return tuple(range(1, seeds + 1))
+
+
 class Run(NamedTuple):
     """One estimator on one log; seed is None for a recorded log."""
 
@@ -147,7 +160,8 @@ class Experiment:
         name: its folder under `results`.
         description: what it asks, in a sentence or two.
         logs, estimators: at least one each.
-        seeds: of the simulated logs; all estimators share a seed's log, so their differences are paired.
+        seeds: of the simulated logs, or how many, counted from 1; all estimators share a seed's log, so differences are
+            paired.
         scores: how runs are scored; a log may override `align` and `dims`.
         max_gap_s: longest gap in the IMU that is bridged.
         timeout_s: longest time for one run.
@@ -157,7 +171,9 @@ class Experiment:
     logs: Annotated[tuple[LogSpec, ...], Field(min_length=1)]
     estimators: Annotated[tuple[EstimatorSpec, ...], Field(min_length=1)]
     description: str = ""
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1)] = (1,)
+    seeds: Annotated[
+        tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1), BeforeValidator(_counted_from_one)
+    ] = (1,)
     scores: Scoring = Scoring()
     max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0

@@ -105,6 +105,17 @@ scores: {rpe_delta: 5}
     assert plan.scoring(plan.logs[1]).rpe_delta == 5.0
 
 
+def test_a_number_of_seeds_counts_from_one() -> None:
+    assert experiment(seeds=3).seeds == (1, 2, 3)
+    assert experiment(seeds=[3]).seeds == (3,)
+
+
+@pytest.mark.parametrize("seeds", [0, -1, 10**6, "three", True, 2.0])
+def test_seeds_that_are_neither_a_list_nor_a_number_of_them_are_refused(seeds: object) -> None:
+    with pytest.raises(ExperimentError, match="seeds: expected a list of seeds, or how many"):
+        experiment(seeds=seeds)
+
+
 def test_the_spec_of_a_run_holds_every_default_and_is_json() -> None:
     plan = experiment(estimators=[{"name": "eskf", "with": {"factors": ["heading", "dvl", "depth"]}}])
     spec = json.loads(json.dumps(plan.spec(plan.runs()[0])))
