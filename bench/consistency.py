@@ -3,7 +3,7 @@
 The errors of a consistent estimator are correlated in time, so an average over time is not chi-square, and an interval
 that takes it for that raises false alarms. Averages over seeds are, time by time: N seeds of a block with d degrees of
 freedom sum to chi-square with N d. The interval at each of n times has probability 1 − FALSE_ALARM / n, so that all n
-together raise a false alarm in at most one table of 1/FALSE_ALARM.
+together, one line of a figure, raise a false alarm at most once in 1/FALSE_ALARM; a table of 100 such once in ten.
 
 Innovations are white, so their NIS may be pooled over time and seeds alike.
 
@@ -13,6 +13,7 @@ Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -135,7 +136,8 @@ def anees(values: Array, dof: int, t_s: Array) -> Average:
 def anees_of(runs: Sequence[str | None]) -> dict[Block, Average]:
     """Average over seeds what `nees_at` returned, as the store has it (JSON); blocks that no run has are left out."""
     every: list[dict[str, list[float | None]]] = [of_run for run in runs if run and (of_run := json.loads(run))]
-    every = [run for run in every if len(run["t_s"]) == len(every[-1]["t_s"])]  # as many times as the newest run has
+    usual = Counter(len(run["t_s"]) for run in every).most_common(1)
+    every = [run for run in every if len(run["t_s"]) == usual[0][0]]  # a run that was asked for other times is left out
     found: dict[Block, Average] = {}
     for block in BLOCKS:
         of_block = [run for run in every if block in run]

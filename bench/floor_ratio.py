@@ -30,13 +30,17 @@ OVER = {
 """Which score stands over which floor, by block."""
 
 
+FEWEST_SEEDS = 5
+"""With fewer, the bootstrap's 95 % interval holds the truth in half to three quarters of cases; with 20, in 91 %."""
+
+
 @dataclass(frozen=True)
 class FloorRatio:
     """An estimator's RMSE over the floor's; 1 for the best there can be.
 
     Attributes:
         ratio: of the root of the mean squared error to that of the mean bound.
-        low, high: bootstrap interval; None with fewer than two seeds.
+        low, high: bootstrap interval; None with fewer than FEWEST_SEEDS.
         level: of the interval.
         seeds: how many runs.
     """
@@ -108,8 +112,8 @@ def rmse_over_floor(
     if len(e) == 0 or e.shape != f.shape or not (np.isfinite(e).all() and np.isfinite(f).all() and f.min() > 0):
         raise ScoreError("floor: a ratio needs at least one seed, and of each a finite error and a positive bound")
     ratio = float(_ratio(e, f))
-    if len(e) == 1:
-        return FloorRatio(ratio, None, None, level, 1)
+    if len(e) < FEWEST_SEEDS:
+        return FloorRatio(ratio, None, None, level, len(e))
     if np.ptp(e / f) <= 1e-12 * ratio**2:  # every resample says the same
         return FloorRatio(ratio, ratio, ratio, level, len(e))
     interval = stats.bootstrap(

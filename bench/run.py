@@ -423,7 +423,7 @@ class Scoring:
         score_period_s: beliefs are asked for this far apart; 1 ms or more.
         nees_epochs: at how many times, evenly spaced over the log, NEES is averaged over the seeds (see `consistency`).
         nis: judge the estimators by their innovations, see `run_log`; their costs are then not to be compared.
-        floor: find the posterior Cramér–Rao bound of every output, of simulated logs.
+        floor: find the posterior Cramér–Rao bound of every output; of simulated logs, unaligned and in 3d.
     """
 
     align: Alignment = "none"

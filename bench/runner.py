@@ -34,6 +34,7 @@ from .consistency import nees_at
 from .experiment import Experiment, ExperimentError, Run, plain
 from .floor import Floor, floors
 from .floor_ratio import FLOORS, floor_scores
+from .metrics import ScoreError
 from .run import Result, can_judge, costs, innovation_dof, innovation_scores, run_log, scores, warm_up
 from .store import Row, Store, provenance
 
@@ -416,7 +417,10 @@ class Bench:
             row = task.row(result.status, result.cause, output) | shared | scores(log, trajectory, scoring)
             if output == "online":
                 row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
-            row |= self.floor(task, result, trajectory.lookahead_s)
+            try:
+                row |= self.floor(task, result, trajectory.lookahead_s)
+            except ScoreError as error:  # a look-ahead that is none, say: the run is none the worse
+                row["notes"] = json.dumps([*log.notes, *result.notes, str(error)])
             if can_judge(log, scoring):
                 row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
             rows.append(row | {"lookahead_s": trajectory.lookahead_s, "trajectory": name})

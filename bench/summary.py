@@ -118,7 +118,7 @@ def _over_floor(done: Sequence[Record]) -> Record:
     """Return each RMSE over its floor, with its 95 % interval over seeds."""
     record: Record = {}
     for block, (score, floor) in OVER.items():
-        known = [row for row in done if row[score] is not None and row[floor] is not None]
+        known = [row for row in done if row[score] is not None and row[floor]]  # over no floor there is no ratio
         squared_error, bound = (np.array([row[name] ** 2 for row in known]) for name in (score, floor))
         ratio = rmse_over_floor(squared_error, bound) if known else None
         for part in ("ratio", "low", "high"):

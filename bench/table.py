@@ -111,7 +111,10 @@ def _floor(summary: Sequence[Record]) -> Table | None:
     """RMSE over the posterior Cramér–Rao bound; None where that is not known."""
     if not any(row[floor] is not None for row in summary for _, floor in OVER.values()):
         return None
-    caption = "RMSE over the posterior Cramér–Rao bound of the same look-ahead; its 95 % bootstrap interval over seeds"
+    caption = (
+        "RMSE over the posterior Cramér–Rao bound of that look-ahead, with a 95 % bootstrap interval over seeds\n"
+        "(from 5 seeds on; with 20 it holds in 91 % of cases)"
+    )
     table = _empty(f"{summary[0]['log']}: over the floor", caption, ("sees\nahead", "runs", *OVER))
     for (label,), of_label in groups(summary, "label").items():
         for k, row in enumerate(of_label):
@@ -176,7 +179,10 @@ def _late_or_out(summary: Sequence[Record]) -> Table | None:
     columns |= {name: f"outliers\n{name.removeprefix(OUTLIERS)}" for name in outliers}
     if not any(row[name] for row in summary for name in ("late_used", "late_dropped", *outliers)):
         return None
-    caption = "over all runs; carried: tied to the keyframe before by the IMU"
+    caption = (
+        "over all runs; carried: tied to the keyframe before by the IMU\n"
+        "outliers: beyond a filter's gate or a loss's width; of honest readings Huber has 18 %, Cauchy 1.7 % there"
+    )
     table = _empty(f"{summary[0]['log']}: late readings and outliers", caption, columns.values())
     for (label,), (row, *_) in groups(summary, "label").items():
         table.add_row(Text(label), *(f"{row[name]:,}" for name in columns))

@@ -105,4 +105,4 @@ class BatchSmoother(WholeLogSmoother):
 
     def solver(self, R_BI: Array) -> Solver:
         """See `GraphSmoother.solver`."""
-        return BatchSolver(self.isam2_params(), R_BI, self.extra_updates)
+        return BatchSolver(self.isam2_params(), R_BI, self.factorization, self.extra_updates)

@@ -63,6 +63,10 @@ def levenberg_marquardt_params(factorization: str) -> gtsam.LevenbergMarquardtPa
     return params
 
 
+EDGE_S = 1e-3
+"""By so much a solver's window is longer than the lag: a state of just that age is still there to be asked for."""
+
+
 class IncrementalSolver:
     """iSAM2, with marginalisation of what is older than lag_s, or without where that is None.
 
@@ -73,7 +77,7 @@ class IncrementalSolver:
         self, params: gtsam.ISAM2Params, R_BI: Array, lag_s: float | None = None, extra_updates: int = 0
     ) -> None:
         self._R_BI, self._extra_updates = R_BI, extra_updates
-        self._lagged = None if lag_s is None else gtsam.IncrementalFixedLagSmoother(lag_s, params)
+        self._lagged = None if lag_s is None else gtsam.IncrementalFixedLagSmoother(lag_s + EDGE_S, params)
         self._isam2 = gtsam.ISAM2(params) if self._lagged is None else None
 
     @property
@@ -118,7 +122,7 @@ class BatchLagSolver:
 
     def __init__(self, factorization: str, R_BI: Array, lag_s: float) -> None:
         self._R_BI = R_BI
-        self._smoother = gtsam.BatchFixedLagSmoother(lag_s, levenberg_marquardt_params(factorization))
+        self._smoother = gtsam.BatchFixedLagSmoother(lag_s + EDGE_S, levenberg_marquardt_params(factorization))
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[Any, Any]) -> None:
         """See `Solver.update`."""
@@ -154,8 +158,9 @@ class BatchSolver(IncrementalSolver):
     Covariances are iSAM2's, whose linearisation points are the optimum's within its thresholds, in the optimum's axes.
     """
 
-    def __init__(self, params: gtsam.ISAM2Params, R_BI: Array, extra_updates: int = 0) -> None:
+    def __init__(self, params: gtsam.ISAM2Params, R_BI: Array, factorization: str, extra_updates: int = 0) -> None:
         super().__init__(params, R_BI, extra_updates=extra_updates)
+        self._factorization = factorization
         self._every_factor = gtsam.NonlinearFactorGraph()
         self._optimum: gtsam.Values | None = None
 
@@ -174,6 +179,6 @@ class BatchSolver(IncrementalSolver):
 
     def finish(self) -> None:
         """Solve the whole log."""
-        params = levenberg_marquardt_params("QR")
+        params = levenberg_marquardt_params(self._factorization)
         guess = self.isam2.calculateBestEstimate()
         self._optimum = gtsam.LevenbergMarquardtOptimizer(self._every_factor, guess, params).optimize()

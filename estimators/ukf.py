@@ -42,8 +42,8 @@ class UnscentedKalmanFilter(FilterOptions):
         beta: what the covariance's weight of the middle point knows of the fourth moments; 2 is a Gaussian's.
     """
 
-    alpha: float = Field(default=0.3, gt=0, le=1)
-    beta: float = Field(default=2.0, ge=0)
+    alpha: float = Field(default=0.3, ge=1e-3, le=1)
+    beta: float = Field(default=2.0, ge=0, allow_inf_nan=False)
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
