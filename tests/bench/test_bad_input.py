@@ -150,7 +150,7 @@ HEADING_EVERY_S = 2.0
 
 
 def reach_s(estimator: Any) -> float:
-    """How late a heading may come and still be used."""
+    """How late a heading may come and still be used; a smoother's window begins a lag before its newest keyframe."""
     if not hasattr(estimator, "inflate"):
         return HEADING_EVERY_S  # dead reckoning takes it as of now, until there is a newer one
     return getattr(estimator, "max_delay_s", getattr(estimator, "lag_s", math.inf))
@@ -164,8 +164,8 @@ def long_log() -> Log:
 
 @every
 def test_a_late_reading_counts_if_it_is_within_reach_and_else_is_counted(long_log: Log, name: str) -> None:
-    """One heading comes 0.3 s late, one 4 s, one 100 s. Those out of reach leave no trace but in the count."""
-    delay_s, heading = {3: 0.3, 5: 4.0, 7: 100.0}, long_log.heading
+    """One heading comes 0.3 s late, one 4.5 s, one 100 s. Those out of reach leave no trace but in the count."""
+    delay_s, heading = {3: 0.3, 5: 4.5, 7: 100.0}, long_log.heading
     received_ns, estimator = heading.received_ns.copy(), create(name)
     for row, by_s in delay_s.items():
         received_ns[row] += int(by_s * SECOND)

@@ -355,14 +355,14 @@ def test_squares_are_those_of_the_block_at_common_times() -> None:
 
 
 def test_the_ratio_is_of_pooled_squares_and_its_interval_is_paired() -> None:
-    error, bound = np.array([1.0, 4.0, 7.0]), np.array([0.5, 1.0, 1.5])
+    error, bound = np.tile([1.0, 4.0, 7.0], 2), np.tile([0.5, 1.0, 1.5], 2)
     assert rmse_over_floor(error, bound).ratio == pytest.approx(2.0)
     same = rmse_over_floor(1.21 * bound, bound)  # a seed's error and bound stay together: nothing is uncertain
     assert (same.low, same.high) == pytest.approx((1.1, 1.1))
-    one = rmse_over_floor(error[:1], bound[:1])
-    assert (one.low, one.high, one.seeds) == (None, None, 1)
+    few = rmse_over_floor(error[:4], bound[:4])
+    assert (few.low, few.high, few.seeds) == (None, None, 4)
     assert rmse_over_floor(error, bound, seed=7) == rmse_over_floor(error, bound, seed=7)
-    for bad in ((error, 0 * bound), (np.array([1.0, np.nan, 1.0]), bound), (error[:0], bound[:0]), (error, bound[:2])):
+    for bad in ((error, 0 * bound), (error * np.nan, bound), (error[:0], bound[:0]), (error, bound[:2])):
         with pytest.raises(ScoreError, match="at least one seed"):
             rmse_over_floor(*bad)
 
