@@ -217,7 +217,7 @@ def test_ctrl_c_keeps_the_finished_runs_and_exits_130(tmp_path: Path) -> None:
         while count(store) < 3 and time.monotonic() < deadline and running.poll() is None:
             time.sleep(0.05)
         os.killpg(running.pid, signal.SIGINT)  # as the terminal does: parent and workers
-        out, err = running.communicate(timeout=30)
+        out, err = running.communicate(timeout=120)
     finally:
         running.kill()
     assert running.returncode == 130, err
