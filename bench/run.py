@@ -17,6 +17,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from ..datasets.epochs import SENSOR, Epoch, Voyage, cut
 from ..datasets.log import AttitudeStream, HeadingStream, Log
+from ..datasets.quantities import Positive
 from ..datasets.rig import Rig
 from ..datasets.state import Belief, TimeArray
 from ..datasets.trajectory import Trajectory
@@ -46,7 +47,6 @@ from .metrics import (
 )
 
 Status: TypeAlias = Literal["done", "diverged", "failed"]
-Positive: TypeAlias = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 LOST_M = 1e7
 """Nothing on Earth is this far from W's origin, m: an estimate that says so has diverged."""

@@ -15,18 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError, nearest
+from .quantities import Finite, NotNegative, Positive, Vector
 from .rig import ImuNoise, Mounting
 from .state import LIMIT_NS, Array, Belief, NavState
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Sigma = Annotated[float, Field(gt=0)]
 Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
 """Seconds to add to a time, s: 73 years at most, so that no sum of them overflows."""
 Column = int | str
-Triple = tuple[Finite, Finite, Finite]
-Matrix = tuple[Triple, Triple, Triple]
+Matrix = tuple[Vector, Vector, Vector]
 
 
 class Part(BaseModel):
@@ -225,7 +222,7 @@ class Outliers(Part):
 class MountingDescription(Part):
     """Pose of a sensor's axes (FRD already turned to FLU) on the body FLU: R_BS = Rz(yaw) Ry(pitch) Rx(roll)."""
 
-    translation_m: Triple = (0.0, 0.0, 0.0)
+    translation_m: Vector = (0.0, 0.0, 0.0)
     roll_deg: Finite = 0.0
     pitch_deg: Finite = 0.0
     yaw_deg: Finite = 0.0
@@ -452,10 +449,10 @@ class PriorDescription(Part):
 
     t_ns: Annotated[int, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
     R_WB: Matrix
-    p_WB_W: Triple
-    v_WB_W: Triple
-    b_a: Triple
-    b_g: Triple
+    p_WB_W: Vector
+    v_WB_W: Vector
+    b_a: Vector
+    b_g: Vector
     P: tuple[tuple[Finite, ...], ...]
     """Symmetric and positive semi-definite: a zero says that this error is known to be none."""
 
