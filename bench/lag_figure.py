@@ -10,13 +10,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from .drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
+from .floor_ratio import OVER
 from .summary import Record, groups
 
-PANELS = {
-    "position error, m": ("ate_rmse_m", "floor_position_m"),
-    "attitude error, °": ("rotation_rmse_deg", "floor_attitude_deg"),
-    "velocity error, m/s": ("velocity_rmse_m_s", "floor_velocity_m_s"),
-}
+UNITS = {"position": "m", "attitude": "°", "velocity": "m/s"}
 FEWEST_LAGS = 3
 
 
@@ -39,13 +36,13 @@ def draw_lag_curve(summary: Sequence[Record], looks: dict[str, Look], title: str
     ahead = {row["label"]: row["lookahead_s"] for row in summary if row["output"] == "hindsight"}
     ticks = sorted({*ahead.values(), 0.0})
     figure, panels = empty_figure(2, 2, WIDTH_IN, 6.0)
-    for axes, (heading, (score, floor)) in zip(panels, PANELS.items(), strict=False):
-        curve_last = sorted(summary, key=lambda row: row["estimator"] == curve)  # with other sensors, another floor
+    curve_last = sorted(summary, key=lambda row: row["estimator"] == curve)  # with other sensors, another floor
+    for axes, (block, (score, floor)) in zip(panels, OVER.items(), strict=False):
         bound = {row["lookahead_s"]: row[floor] for row in curve_last if row[floor] is not None}
         known = [seen for seen in ticks if seen in bound]
         axes.plot([ticks.index(seen) for seen in known], [bound[seen] for seen in known], color="black", linewidth=1.6)
         _draw(axes, summary, looks, ahead, ticks, curve, score)
-        axes.set_title(heading, fontsize=9)
+        axes.set_title(f"{block} error, {UNITS[block]}", fontsize=9)
     priced = [row | {"cost": 1e3 / row["real_time_factor"]} for row in summary if row["real_time_factor"]]
     online = [row for row in priced if row["output"] == "online"]
     _draw(panels[3], online, looks, ahead, ticks, curve, "cost")
@@ -69,8 +66,8 @@ def draw_lag_curve(summary: Sequence[Record], looks: dict[str, Look], title: str
         )
         for row in shown
     ]
-    handles += [handle("with hindsight", "o", "black", False), Line2D([], [], color="black", linewidth=1.6)]
-    handles[-1].set_label("floor (Cramér–Rao)")
+    handles.append(handle("with hindsight", "o", "black", False))
+    handles.append(Line2D([], [], color="black", linewidth=1.6, label="floor (Cramér–Rao)"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
 

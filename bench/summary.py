@@ -79,6 +79,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
     """
     every = records(rows)
     runs = {key: len(groups(of, "seed")) for key, of in groups(every, "log", "label").items()}
+    counted = COUNTS | {name: (name,) for name in _outliers(every)}
     summary = []
     for (log, label, output), group in groups(every, "log", "label", "output").items():
         done = [row for row in group if row["status"] == "done"]
@@ -92,8 +93,8 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
         record |= _over_floor(done)
         record |= _honesty(done)
-        record |= {name: _counted(done, of) for name, of in COUNTS.items()}
-        record |= {name: _counted(done, [name]) for name in _outliers(every)}
+        counts = [json.loads(row["counts"] or "{}") for row in done]
+        record |= {name: sum(run.get(of, 0) for run in counts for of in each) for name, each in counted.items()}
         summary.append(record)
     return summary
 
@@ -121,9 +122,8 @@ def _over_floor(done: Sequence[Record]) -> Record:
         known = [row for row in done if row[score] is not None and row[floor]]  # over no floor there is no ratio
         squared_error, bound = (np.array([row[name] ** 2 for row in known]) for name in (score, floor))
         ratio = rmse_over_floor(squared_error, bound) if known else None
-        for part in ("ratio", "low", "high"):
-            name = f"over_floor_{block}" if part == "ratio" else f"over_floor_{block}_{part}"
-            record[name] = None if ratio is None else getattr(ratio, part)
+        for part, name in {"": "ratio", "_low": "low", "_high": "high"}.items():
+            record[f"over_floor_{block}{part}"] = None if ratio is None else getattr(ratio, name)
     return record
 
 
@@ -167,12 +167,6 @@ def is_judged(summary: Sequence[Record]) -> bool:
     """Return whether there is enough of honesty to show: some NIS, or ANEES over enough seeds."""
     enough = [row["done"] >= SEEDS_ENOUGH and row["anees_times"] is not None for row in summary]
     return any(enough) or any(row[name] is not None for row in summary for name in INNOVATIONS)
-
-
-def _counted(done: Sequence[Record], names: Iterable[str]) -> int:
-    """Return the sum of these counts over the runs."""
-    counts = [json.loads(row["counts"] or "{}") for row in done]
-    return sum(of_run.get(name, 0) for of_run in counts for name in names)
 
 
 def _outliers(rows: Iterable[Record]) -> list[str]:

@@ -55,12 +55,13 @@ def print_table(rows: pd.DataFrame, console: Console | None = None) -> None:
         console = Console()
         if not console.is_terminal:
             console = Console(width=120)
-    for summary in groups(summarise(rows), "log").values():
+    every = summarise(rows)
+    for summary in groups(every, "log").values():
         for table in (_accuracy(summary), _floor(summary), _honesty(summary), _late_or_out(summary)):
             if table is not None:
                 console.print(table)
                 console.print()
-    for line in failures(rows) + mostly_outside(rows) + not_positive(rows):
+    for line in failures(rows) + mostly_outside(rows) + not_positive(every):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
 
 
@@ -88,11 +89,11 @@ def mostly_outside(rows: pd.DataFrame) -> list[str]:
     return list(lines.values())
 
 
-def not_positive(rows: pd.DataFrame) -> list[str]:
+def not_positive(summary: Sequence[Record]) -> list[str]:
     """Return a line for each estimator whose covariance is not positive definite somewhere."""
     return [
         f"{row['log']} / {row['label']} {row['output']}: {row['n_not_positive']} covariances are not positive definite"
-        for row in summarise(rows)
+        for row in summary
         if row["n_not_positive"]
     ]
 
