@@ -37,6 +37,7 @@ from .gtsam_border import (
     tight_displacement_factor,
 )
 from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
+from .innovation import normalised_square
 from .interface import FACTORS, Diverged, Factors, Inflation
 from .measurements import measure
 from .records import as_belief, as_record, split, with_rate_noise
@@ -295,9 +296,8 @@ class GraphPass:
     def _update(self, values: gtsam.Values, new: Keyframe) -> None:
         """Let what is about to leave the window leave with hindsight, then update, and read off the newest state."""
         t_s = (new.t_ns - self._start_ns) * 1e-9
-        horizon_ns = (
-            new.t_ns - (self._config.window_s + 0.5 * EDGE_S) * 1e9
-        )  # one of just that age has yet to see `new`
+        # a state of just the window's age stays, for it has yet to see `new`
+        horizon_ns = new.t_ns - (self._config.window_s + 0.5 * EDGE_S) * 1e9
         leaving = []
         while self._window and self._window[0].t_ns < horizon_ns and self._window[0] is not new:
             leaving.append(self._window.popleft())
@@ -431,8 +431,7 @@ class GraphPass:
         r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
         if loss is None or not (n := measure(reading, 0, state, self._rig, r, H, C)):
             return reading
-        d = np.sqrt(r[:n] @ np.linalg.solve(C[:n, :n], r[:n]))
-        weight = m_estimator(loss, n).weight(d)
+        weight = m_estimator(loss, n).weight(np.sqrt(normalised_square(r[:n], C[:n, :n])))
         reading = reading.copy()
         reading["sigma"] = reading["sigma"] / np.sqrt(weight) if weight > 0 else np.inf
         return reading

@@ -39,8 +39,8 @@ class IncrementalSmoother(GraphSmoother):
 
 
 @dataclass(frozen=True)
-class FixedLagSmoother(IncrementalSmoother):
-    """MAP over the last lag_s seconds; older states are marginalised out (GTSAM's IncrementalFixedLagSmoother).
+class LaggedSmoother(GraphSmoother):
+    """What keeps the last lag_s seconds and marginalises out what is older.
 
     Attributes:
         lag_s: length of the window; 0 keeps the newest keyframe alone, and is a filter.
@@ -52,6 +52,11 @@ class FixedLagSmoother(IncrementalSmoother):
     def window_s(self) -> float:
         """See `GraphSmoother.window_s`."""
         return self.lag_s
+
+
+@dataclass(frozen=True)
+class FixedLagSmoother(LaggedSmoother, IncrementalSmoother):
+    """MAP over the last lag_s seconds; older states are marginalised out (GTSAM's IncrementalFixedLagSmoother)."""
 
     def solver(self, R_BI: Array) -> Solver:
         """See `GraphSmoother.solver`."""
@@ -59,21 +64,11 @@ class FixedLagSmoother(IncrementalSmoother):
 
 
 @dataclass(frozen=True)
-class BatchFixedLagSmoother(GraphSmoother):
+class BatchFixedLagSmoother(LaggedSmoother):
     """MAP over the last lag_s seconds, solved anew at every keyframe (GTSAM's BatchFixedLagSmoother).
 
     The same estimate as an iSAM2 that linearises everything anew in every step; a keyframe's cost grows with the lag.
-
-    Attributes:
-        lag_s: length of the window; 0 keeps the newest keyframe alone, and is a filter.
     """
-
-    lag_s: NonNegative = 3.0
-
-    @property
-    def window_s(self) -> float:
-        """See `GraphSmoother.window_s`."""
-        return self.lag_s
 
     def solver(self, R_BI: Array) -> Solver:
         """See `GraphSmoother.solver`."""
