@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Annotated, Protocol, TypeVar, runtime_checkable
 
 from pydantic import AfterValidator, Field
 
@@ -17,33 +17,28 @@ FACTORS = frozenset({"depth", "gps", "heading", "dvl"})
 """The aiding sensors that an estimator may be allowed."""
 
 
-def check_sensors(names: Collection[str], known: frozenset[str]) -> None:
-    """Raise ValueError, with the nearest known name, where a sensor is not one of those known."""
-    for name in names:
-        if name not in known:
-            raise ValueError(f"no sensor {name!r}{nearest(name, known)} (known: {', '.join(sorted(known))})")
+SensorNames = TypeVar("SensorNames", bound=Collection[str])
 
 
-def _factors(names: frozenset[str]) -> frozenset[str]:
-    check_sensors(names, FACTORS)
-    return names
+def sensors_among(known: frozenset[str]) -> AfterValidator:
+    """Return a validator of names, or of a mapping by name, that refuses a sensor that is not one of those known."""
+
+    def check(names: SensorNames) -> SensorNames:
+        for name in names:
+            if name not in known:
+                raise ValueError(f"no sensor {name!r}{nearest(name, known)} (known: {', '.join(sorted(known))})")
+        return names
+
+    return AfterValidator(check)
 
 
-def _inflate(factor_by_sensor: dict[str, float]) -> dict[str, float]:
-    check_sensors(factor_by_sensor, FACTORS | {"gyro", "accel"})
-    return factor_by_sensor
-
-
-def _gate(probability_by_sensor: dict[str, float]) -> dict[str, float]:
-    check_sensors(probability_by_sensor, FACTORS)
-    return probability_by_sensor
-
-
-Factors = Annotated[frozenset[str], AfterValidator(_factors)]
+Factors = Annotated[frozenset[str], sensors_among(FACTORS)]
 """Which aiding sensors an estimator may use."""
-Inflation = Annotated[dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]], AfterValidator(_inflate)]
+Inflation = Annotated[
+    dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]], sensors_among(FACTORS | {"gyro", "accel"})
+]
 """Factor on the stated sigma by sensor; also "gyro" and "accel"."""
-Gate = Annotated[dict[str, Annotated[float, Field(gt=0, lt=1)]], AfterValidator(_gate)]
+Gate = Annotated[dict[str, Annotated[float, Field(gt=0, lt=1)]], sensors_among(FACTORS)]
 """Probability by sensor: a reading that an honest filter would find less likely than all but this share is left out."""
 
 

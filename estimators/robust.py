@@ -17,11 +17,10 @@ from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
-from pydantic import AfterValidator
 from scipy.stats import chi2
 
 from ..datasets.state import Array
-from .interface import FACTORS, check_sensors
+from .interface import FACTORS, sensors_among
 
 Loss = Literal["huber", "cauchy", "tukey"]
 WIDTHS: dict[Loss, float] = {"huber": 1.345, "cauchy": 2.3849, "tukey": 4.6851}
@@ -33,12 +32,7 @@ M_ESTIMATORS: dict[Loss, Any] = {
 }
 
 
-def _losses(loss_by_sensor: dict[str, Loss]) -> dict[str, Loss]:
-    check_sensors(loss_by_sensor, FACTORS)
-    return loss_by_sensor
-
-
-Losses = Annotated[dict[str, Loss], AfterValidator(_losses)]
+Losses = Annotated[dict[str, Loss], sensors_among(FACTORS)]
 """Loss by sensor; a sensor that is not named has none."""
 
 
