@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass
 
 from ..datasets.rig import Rig
 from ..datasets.state import THETA, Array, Belief
-from .filter_pass import FilterOptions, FilterPass
+from .filter_pass import FilterOptions, FilterPass, Kalman
 from .imu import integrate, predict, process_noise, sandwich
 from .measurements import decorrelate, measure
 from .so3 import exp, product, right_jacobian
@@ -113,13 +113,15 @@ def inject(state: NDArray[Any], dx: Array) -> None:
             s.P[i, j] = s.P[j, i] = 0.5 * (s.P[i, j] + s.P[j, i])
 
 
-class ErrorStateKalman:
+class ErrorStateKalman(Kalman):
     """See `Kalman`: the functions of this module."""
 
-    predict = staticmethod(propagate)
-    correct = staticmethod(correct)
+    def predict(
+        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
+    ) -> None:
+        """See `Kalman.predict`."""
+        propagate(state, rig, before, imu, block)
 
-    @staticmethod
-    def error_covariance(state: NDArray[Any]) -> Array:
-        """P is of our error state."""
-        return state["P"][0]
+    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
+        """See `Kalman.correct`."""
+        return correct(state, rig, readings)

@@ -17,7 +17,7 @@ from scipy.linalg import LinAlgWarning
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, Array, Belief
 from .eskf import inject
-from .filter_pass import FilterOptions, FilterPass
+from .filter_pass import FilterOptions, FilterPass, Kalman
 from .imu import integrate, predict, process_noise
 from .measurements import measure
 
@@ -31,7 +31,7 @@ class FilterpyKalmanFilter(FilterOptions):
         return FilterPass(self, prior, rig, FilterpyKalman())
 
 
-class FilterpyKalman:
+class FilterpyKalman(Kalman):
     """See `Kalman`."""
 
     def __init__(self) -> None:
@@ -65,10 +65,6 @@ class FilterpyKalman:
         state[0]["P"] = ekf.P
         inject(state, ekf.x)
         return bool(np.isfinite(ekf.x).all())
-
-    def error_covariance(self, state: NDArray[Any]) -> Array:
-        """P is of our error state."""
-        return state["P"][0]
 
     def _about(self, state: NDArray[Any]) -> Any:
         """Return filterpy's filter of the state's error, which is zero."""

@@ -6,9 +6,10 @@ that filters differ in their filtering alone.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,25 +47,25 @@ class FilterOptions:
     merge_ns: int = Field(default=1_000_000, ge=0)
 
 
-class Kalman(Protocol):
+class Kalman(ABC):
     """What makes a filter: how it carries a STATE record (of length 1) over a motion, and corrects it, in place.
 
     Its P may be of any error it likes, as long as it can be said in ours. Either step may raise Diverged.
     """
 
+    @abstractmethod
     def predict(
         self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
     ) -> None:
         """Carry the state over IMU_SAMPLE rows; `before` is the one before them. Fills `block` with their motion."""
-        ...
 
+    @abstractmethod
     def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
         """Correct by readings that are all true now; False where that is impossible."""
-        ...
 
     def error_covariance(self, state: NDArray[Any]) -> Array:
-        """Return the covariance (15, 15) of our error state."""
-        ...
+        """Return the covariance (15, 15) of our error state: P itself, unless the filter's error is another."""
+        return state["P"][0]
 
 
 class Lived(NamedTuple):

@@ -30,7 +30,7 @@ from pydantic.dataclasses import dataclass
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, POSITION, THETA, VELOCITY, Array, Belief
 from .eskf import absorb
-from .filter_pass import FilterOptions, FilterPass
+from .filter_pass import FilterOptions, FilterPass, Kalman
 from .imu import integrate, predict, process_noise, sandwich
 from .measurements import measure
 from .so3 import cross, exp, product, right_jacobian, skew, transform
@@ -50,7 +50,7 @@ class InvariantKalmanFilter(FilterOptions):
         return FilterPass(self, Belief(prior.t_ns, x, P), rig, kalman)
 
 
-class InvariantKalman:
+class InvariantKalman(Kalman):
     """See `Kalman`; every P is of the invariant error, and positions are counted from the origin (3,)."""
 
     def __init__(self, origin: Array) -> None:

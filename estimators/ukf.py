@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass
 from ..datasets.rig import Rig
 from ..datasets.state import DIM, THETA, Array, Belief
 from .eskf import inject
-from .filter_pass import FilterOptions, FilterPass
+from .filter_pass import FilterOptions, FilterPass, Kalman
 from .imu import integrate, predict, process_noise
 from .interface import Diverged
 from .measurements import measure
@@ -50,7 +50,7 @@ class UnscentedKalmanFilter(FilterOptions):
         return FilterPass(self, prior, rig, UnscentedKalman(self.alpha, self.beta))
 
 
-class UnscentedKalman:
+class UnscentedKalman(Kalman):
     """See `Kalman`; holds the points and their weights."""
 
     def __init__(self, alpha: float, beta: float) -> None:
@@ -84,10 +84,6 @@ class UnscentedKalman:
         state[0]["P"] -= K @ S @ K.T
         inject(state, -K @ mean)
         return bool(np.isfinite(state[0]["P"]).all())
-
-    def error_covariance(self, state: NDArray[Any]) -> Array:
-        """P is of our error state."""
-        return state["P"][0]
 
     def _sigma_points(self, state: NDArray[Any]) -> Array:
         """Return the points (31, 15), errors about the state.
