@@ -180,10 +180,11 @@ def _late_or_out(summary: Sequence[Record]) -> Table | None:
     columns |= {name: f"outliers\n{name.removeprefix(OUTLIERS)}" for name in outliers}
     if not any(row[name] for row in summary for name in ("late_used", "late_dropped", *outliers)):
         return None
-    caption = (
-        "over all runs; carried: tied to the keyframe before by the IMU\n"
-        "outliers: beyond a filter's gate or a loss's width; of honest readings Huber has 18 %, Cauchy 1.7 % there"
-    )
+    caption = "over all runs; carried: tied to the keyframe before by the IMU"
+    if outliers:
+        caption += (
+            "\noutliers: beyond a filter's gate or a loss's width; of honest readings Huber has 18 %, Cauchy 1.7 %"
+        )
     table = _empty(f"{summary[0]['log']}: late readings and outliers", caption, columns.values())
     for (label,), (row, *_) in groups(summary, "label").items():
         table.add_row(Text(label), *(f"{row[name]:,}" for name in columns))
