@@ -17,7 +17,7 @@ class Finding:
     Attributes:
         stream: where, as the description calls it: "imu", "dvl", "truth".
         says: one plain sentence with its figures.
-        mend: what to put into log.yaml, by its path ("streams.dvl.time.delay_s: 0.5"); "" where nothing there would help.
+        mend: what to put into log.yaml, by its path ("streams.dvl.time.delay_s: 0.5"); "" where that helps nothing.
     """
 
     stream: str
