@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
         DatasetError: no such file or column, or a field that is not a number; names the file, the row (from 0, headers
             and comments not counted) and the value.
     """
+    if table.file is None:
+        return _read_arrays(folder, table.arrays, [*columns, *times])
     path = folder / table.file
     if not path.is_file():
         names = [p.name for p in path.parent.iterdir() if p.is_file()] if path.parent.is_dir() else []
@@ -56,6 +58,30 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
             named = ", ".join(str(c) for c in found[:40])
             raise DatasetError(f"{path}: no column {column!r}{nearest(str(column), map(str, found))}; found {named}")
     return {c: frame[c].to_numpy() if c in times else _numbers(pd.Series(frame[c]), path) for c in wanted}
+
+
+def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Column]) -> Columns:
+    """Read NumPy arrays of one length; `name.0`, `name.1` are the columns of a two-dimensional one."""
+    found: dict[str, NDArray[Any]] = {}
+    for name, file in arrays.items():
+        path = folder / file
+        if not path.is_file():
+            names = [p.name for p in path.parent.iterdir() if p.is_file()] if path.parent.is_dir() else []
+            raise DatasetError(f"{path}: no such file{nearest(path.name, names)}")
+        try:
+            values = np.load(path, mmap_mode="r", allow_pickle=False)
+        except Exception as error:  # numpy raises many kinds for a file that is not what it seems
+            raise DatasetError(f"{path}: cannot be read as an array: {str(error)[:200]}") from None
+        if not isinstance(values, np.ndarray) or values.ndim not in (1, 2) or values.dtype.kind not in "iufb":
+            raise DatasetError(f"{path}: expected numbers in rows and columns, found {getattr(values, 'shape', '?')}")
+        found |= {name: values} if values.ndim == 1 else {f"{name}.{i}": values[:, i] for i in range(values.shape[1])}
+    lengths = {name: len(values) for name, values in found.items()}
+    if len(set(lengths.values())) > 1:
+        raise DatasetError(f"{folder}: arrays that stand side by side must be of one length, found {lengths}")
+    for column in wanted:
+        if str(column) not in found:
+            raise DatasetError(f"{folder}: no column {column!r}{nearest(str(column), found)}; found {', '.join(found)}")
+    return {column: np.array(found[str(column)]) for column in dict.fromkeys(wanted)}
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:

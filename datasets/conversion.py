@@ -9,7 +9,7 @@ with the IMU is an error: some clock is wrong.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from . import description as d
-from .columns import EXACT, Columns, read_table, times_ns
-from .errors import DatasetError, nearest
+from .columns import EXACT, NS_PER, Columns, read_table, times_ns
+from .device_clock import common_instants
+from .errors import DatasetError
 from .geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
 from .log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
+from .recording import Wanted
 from .rig import Rig
 from .state import Array, TimeArray
 from .trajectory import Trajectory
@@ -31,6 +33,8 @@ from .trajectory import Trajectory
 Mask = NDArray[Any]
 FLIP_YZ = np.array([1.0, -1.0, -1.0])
 """FRD to FLU, and back."""
+DEVICE = "device"
+"""The column that a message's own clock adds."""
 
 
 @dataclass
@@ -41,27 +45,81 @@ class _Opening:
     folder: Path
     repair: bool
     notes: list[str] = field(default_factory=list)
-    lsf: Any = None
+    messages: dict[tuple[str, int | None], Mapping[str, NDArray[Any]]] | None = None
 
-    def columns(self, part: Any, wanted: list[d.Column], times: list[d.Column]) -> Columns:
-        """Read the raw columns a part asks for, from its table or its messages."""
+    def columns(self, part: d.SourceDescription | d.TruthDescription, wanted: Iterable[d.Column]) -> Columns:
+        """Read the raw columns a part asks for, from its table or its messages; times stay as they are written."""
+        times = [] if part.time is None else [c for c in (part.time.column, part.time.received) if c is not None]
         if part.table is not None:
-            return read_table(self.folder, part.table, wanted, times)
-        from .imc import message_columns, read_lsf  # compiles, so only where it is needed
+            return read_table(self.folder, part.table, [c for c in wanted if c not in times], times)
+        assert part.message is not None
+        return self._joined(part.message, list(wanted))
 
-        imc = self.description.imc
-        assert imc is not None
-        if self.lsf is None:
-            self.lsf = read_lsf(self.folder, imc, _message_names(self.description))
-            self.notes += self.lsf.notes
-        where = f"{self.folder / imc.file}"
-        found = message_columns(self.lsf, part.message, where)
-        for column in [*wanted, *times]:
-            if column not in found:
-                hint = nearest(str(column), map(str, found))
-                named = ", ".join(map(str, found))
-                raise DatasetError(f"{where}: {'/'.join(part.message.names)} has no {column!r}{hint}; found {named}")
-        return {column: found[column] for column in [*wanted, *times]}
+    def _joined(self, message: d.Message, wanted: list[d.Column]) -> Columns:
+        """Return columns of messages; `device` is their own clock on the host's."""
+        if self.messages is None:
+            self._read_messages()
+        assert self.messages is not None
+        assert self.description.recording is not None
+        found = [self.messages[name, message.entity] for name in message.names]
+        picks: list[Any] = [slice(None)] * len(found)
+        device: Array | None = None
+        if message.clock is not None:
+            column, unit = self.description.recording.host_clock
+            host_s = [part[column] * (NS_PER[unit] * 1e-9) for part in found]
+            device_s = [part[message.clock.field].astype(float) for part in found]
+            picks, device = common_instants(host_s, device_s, message.clock.wraps_at_s)
+            if not len(device):
+                where = self.description.recording.path(self.folder)
+                raise DatasetError(f"{where}: {' and '.join(message.names)} have no device time in common")
+        columns: Columns = {}
+        for column in wanted:
+            if column == DEVICE and device is not None:
+                columns[column] = device
+            else:
+                which, field_name = _field(message, str(column))
+                columns[column] = found[which][field_name][picks[which]]
+        return columns
+
+    def _read_messages(self) -> None:
+        """Read all that the description asks of its recording, in one pass."""
+        recording = self.description.recording
+        assert recording is not None
+        asked: dict[tuple[str, int | None], dict[str, None]] = {}
+        for part, wanted in _sources(self.description):
+            if part.message is None:
+                continue
+            for name in part.message.names:
+                columns = asked.setdefault((name, part.message.entity), {})
+                if part.message.clock is not None:
+                    columns |= dict.fromkeys((recording.host_clock[0], part.message.clock.field))
+            for column in wanted:
+                if column != DEVICE or part.message.clock is None:
+                    which, field_name = _field(part.message, str(column))
+                    asked[part.message.names[which], part.message.entity][field_name] = None
+        read = recording.read(self.folder, [Wanted(*key, tuple(columns)) for key, columns in asked.items()])
+        self.messages = dict(zip(asked, read.columns, strict=True))
+        self.notes += read.notes
+
+
+def _field(message: d.Message, column: str) -> tuple[int, str]:
+    """Return which of the joined messages a column is of, and its field there."""
+    if len(message.names) == 1:
+        return 0, column
+    for which, name in enumerate(message.names):
+        if column.startswith(f"{name}."):
+            return which, column.removeprefix(f"{name}.")
+    raise DatasetError(f"column {column!r}: expected `Name.field` of one of {', '.join(message.names)}")
+
+
+def _sources(description: d.Description) -> Iterator[tuple[Any, list[d.Column]]]:
+    """Yield every source of columns of a description, with the columns that are asked of it."""
+    for part in description.parts.values():
+        if isinstance(part, d.ImuDescription) and part.accel_source is not None:
+            yield part.accel_source, [*d.columns_of(part.accel_source), *part.accel.columns]
+            yield part, [c for c in d.columns_of(part) if c not in part.accel.columns]
+        else:
+            yield part, d.columns_of(part)
 
 
 @dataclass
@@ -146,7 +204,7 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
         origin = (np.radians(description.origin.latitude_deg), np.radians(description.origin.longitude_deg))
     else:
         for part, rows in ((streams.gps, gps_rows), (truth_part, truth_rows)):
-            if origin is None and part is not None and part.geodetic is not None and rows is not None:
+            if origin is None and part is not None and part.on_the_globe and rows is not None:
                 origin = _first_fix(part, rows, int(imu.t_ns[0]))
     gps = None if gps_rows is None or streams.gps is None else _gps(streams.gps, gps_rows, origin)
     truth = None
@@ -198,12 +256,6 @@ def _check_clocks(log: Log) -> None:
             )
 
 
-def _message_names(description: d.Description) -> list[str]:
-    parts = [*(getattr(description.streams, n) for n in d.Streams.model_fields), description.truth]
-    names = [name for part in parts if part is not None and part.message is not None for name in part.message.names]
-    return list(dict.fromkeys(names))
-
-
 def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) -> _Rows:
     """Read a stream's rows and drop, or refuse, those without a time or without numbers."""
     time: d.Time = part.time
@@ -215,7 +267,7 @@ def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) 
     twice = [c for c in times if c in plain]
     if twice:
         raise DatasetError(f"{opening.folder}: {stream}: column {twice[0]!r} cannot be a time and something else")
-    raw = opening.columns(part, plain, times)
+    raw = opening.columns(part, [*plain, *times])
     count = len(next(iter(raw.values())))
     offset_ns = round(time.clock_offset_s * 1e9)
 
@@ -351,18 +403,54 @@ def _enu(values: Array, frame: str) -> Array:
 
 
 def _imu(opening: _Opening, part: d.ImuDescription) -> ImuStream:
-    rows = _stream(opening, "imu", part, [*part.gyro.columns, *part.accel.columns])
-    _in_order(rows, part.every)
+    if part.accel_source is not None:
+        t_ns, gyro, accel = _gyro_and_accel(opening, part, part.accel_source)
+    else:
+        rows = _stream(opening, "imu", part, [*part.gyro.columns, *part.accel.columns])
+        _in_order(rows, part.every)
+        t_ns, gyro, accel = rows.t_ns, rows.si(part.gyro), rows.si(part.accel)
     with _named(opening.folder):
-        return ImuStream(rows.t_ns, _flu(rows.si(part.gyro), part.axes), _flu(rows.si(part.accel), part.axes))
+        return ImuStream(t_ns, _flu(gyro, part.axes), _flu(accel, part.axes))
+
+
+def _gyro_and_accel(
+    opening: _Opening, part: d.ImuDescription, source: d.SourceDescription
+) -> tuple[TimeArray, Array, Array]:
+    """Return the gyro's times and samples, and the accelerometer's put there linearly.
+
+    A gyro's sample that has no accelerometer's on both sides within two of its periods is dropped, and counted.
+    """
+    rows = _stream(opening, "imu", part, list(part.gyro.columns))
+    _in_order(rows, 1)
+    other = _stream(opening, "imu", source, list(part.accel.columns))
+    _in_order(other, 1)
+    accel, gyro = other.si(part.accel), rows.si(part.gyro)
+    if len(other.t_ns) < 2:
+        raise DatasetError(f"{opening.folder}: imu: {len(other.t_ns)} accelerometer rows, at least 2 are needed")
+    after = np.searchsorted(other.t_ns, rows.t_ns).clip(1, len(other.t_ns) - 1)
+    step = other.t_ns[after] - other.t_ns[after - 1]
+    weight = (rows.t_ns - other.t_ns[after - 1]) / step
+    alone = (weight < 0) | (weight > 1) | ((step > 2 * np.median(np.diff(other.t_ns))) & (weight % 1 != 0))
+    rows.note(int(np.count_nonzero(alone)), "of the gyro without the accelerometer's beside them")
+    at, share = after[~alone], weight[~alone, None]
+    accel = accel[at - 1] * (1 - share) + accel[at] * share
+    kept = slice(None, None, part.every)
+    return rows.t_ns[~alone][kept], gyro[~alone][kept], accel[kept]
 
 
 def _dvl(opening: _Opening, part: d.DvlDescription) -> DvlStream:
     rows = _stream(opening, "dvl", part, list(part.velocity.columns))
-    _checked_width(rows, part, 3)
+    measured = ["xyz".index(axis) for axis in part.measures]
+    _checked_width(rows, part, len(measured))
     values = _without_outliers(rows, part.outliers, rows.si(part.velocity), "m/s")
     values = values[_in_order(rows, part.every)]
-    return DvlStream(rows.t_ns, rows.received_ns, _flu(values, part.axes), _sigma(rows, part, 3))
+    v_S, sigma = np.zeros((len(values), 3)), np.full((len(values), 3), np.inf)
+    v_S[:, measured], sigma[:, measured] = values, _sigma(rows, part, len(measured))
+    v_S = _flu(v_S, part.axes)
+    if part.mounting != d.MountingDescription():
+        R_BS = part.mounting.mounting().R_BS
+        v_S, sigma = v_S @ R_BS.T, np.sqrt(sigma**2 @ (R_BS**2).T)  # the correlations of unequal axes are let go
+    return DvlStream(rows.t_ns, rows.received_ns, v_S, sigma)
 
 
 def _depth(opening: _Opening, part: d.DepthDescription) -> DepthStream:
@@ -400,7 +488,14 @@ def _not_rotations(R: Array) -> Mask:
         return np.asarray(~(off < 1e-6) | ~(np.linalg.det(R) > 0))
 
 
-def _rotations(rows: _Rows, part: d.Attitude) -> Array:
+def _enu_from_ecef(rows: _Rows, origin: tuple[float, float] | None) -> Array:
+    """Return (3, 3): rows are east, north and up at W's origin, in ECEF axes."""
+    if origin is None:
+        raise DatasetError(f"{rows.opening.folder}: {rows.stream}: ECEF axes need W's origin; give `origin`")
+    return enu_axes(np.array(origin[0]), np.array(origin[1]))
+
+
+def _rotations(rows: _Rows, part: d.Attitude, origin: tuple[float, float] | None = None) -> Array:
     """Return (n, 3, 3), body FLU to W; refuse what is not a rotation."""
     values = np.stack([rows.raw[c] for c in part.columns], axis=1).astype(float, copy=False)
     if part.form == "roll_pitch_yaw":
@@ -422,6 +517,8 @@ def _rotations(rows: _Rows, part: d.Attitude) -> Array:
         R = Rotation.from_quat(q_xyzw).as_matrix().reshape(-1, 3, 3)
     if part.world == "NED":
         R = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]) @ R
+    elif part.world == "ECEF":
+        R = _enu_from_ecef(rows, origin) @ R
     return R * FLIP_YZ if part.axes == "FRD" else R
 
 
@@ -464,33 +561,45 @@ def _latitude_longitude(rows: _Rows, part: d.Geodetic) -> tuple[Array, Array]:
     return lat[~bad], lon[~bad]
 
 
+def _on_the_globe(rows: _Rows, part: Any) -> tuple[Array, Array, Array | None]:
+    """Return latitude, longitude (rad) and height (m, where there is one) of rows that tell a place on the globe."""
+    if part.geodetic is None:
+        return geodetic_from_ecef(rows.si(part.position))
+    lat, lon = _latitude_longitude(rows, part.geodetic)  # may drop rows, so it comes first
+    return lat, lon, None if part.geodetic.altitude is None else rows.si(part.geodetic.altitude)[:, 0]
+
+
+def _offset(rows: _Rows, part: Any) -> Array | None:
+    """Return (n, 3) m, the local offset from the place on the globe, where there is one."""
+    return None if part.geodetic is None or part.position is None else _enu(rows.si(part.position), part.frame)
+
+
 def _first_fix(part: Any, rows: _Rows, start_ns: int) -> tuple[float, float] | None:
     """Return the place (rad) of the first row at or after the IMU's start, local offset included."""
-    lat, lon = _latitude_longitude(rows, part.geodetic)
+    lat, lon, _ = _on_the_globe(rows, part)
     after = np.flatnonzero(rows.t_ns >= start_ns)
     if not len(after):
         return None
     row = after[:1]
     p_ecef = ecef_from_geodetic(lat[row], lon[row], np.zeros(1))
-    if part.position is not None:
-        offset = _enu(rows.si(part.position), part.frame)[row] * [1.0, 1.0, 0.0]
-        p_ecef = p_ecef + np.einsum("nji,nj->ni", enu_axes(lat[row], lon[row]), offset)
+    offset = _offset(rows, part)
+    if offset is not None:
+        p_ecef = p_ecef + np.einsum("nji,nj->ni", enu_axes(lat[row], lon[row]), offset[row] * [1.0, 1.0, 0.0])
     latitude, longitude, _ = geodetic_from_ecef(p_ecef)
     return float(latitude[0]), float(longitude[0])
 
 
 def _position(rows: _Rows, part: Any, origin: tuple[float, float] | None) -> Array:
     """Return (n, 3) m in W. Heights are over the surface, not over the tangent plane: the depth sensor's are, too."""
-    if part.geodetic is None:
+    if not part.on_the_globe:
         return _enu(rows.si(part.position), part.frame)
-    lat, lon = _latitude_longitude(rows, part.geodetic)  # may drop rows, so it comes first
+    lat, lon, height = _on_the_globe(rows, part)
     if origin is None:
         raise DatasetError(f"{rows.opening.folder}: {rows.stream}: no fix after the IMU's start; give `origin`")
     p = enu_from_geodetic(lat, lon, np.zeros(len(lat)), (*origin, 0.0))
-    p[:, 2] = 0.0 if part.geodetic.altitude is None else rows.si(part.geodetic.altitude)[:, 0]
-    if part.position is not None:
-        p = p + _enu(rows.si(part.position), part.frame)
-    return p
+    p[:, 2] = 0.0 if height is None else height
+    offset = _offset(rows, part)
+    return p if offset is None else p + offset
 
 
 def _gps(part: d.GpsDescription, rows: _Rows, origin: tuple[float, float] | None) -> GpsStream:
@@ -512,13 +621,15 @@ def _truth(
     if part.trajectory is not None:
         return _read_trajectory(opening.folder / part.trajectory, part.lookahead_s)
     assert rows is not None
-    R = None if part.attitude is None else _rotations(rows, part.attitude)  # may drop rows, so it comes first
+    R = None if part.attitude is None else _rotations(rows, part.attitude, origin)  # may drop rows, so it comes first
     before = rows.number
     p = _position(rows, part, origin)
     if part.height_m is not None:
         p[:, 2] = part.height_m
     R = np.full((len(p), 3, 3), np.nan) if R is None else R[np.isin(before, rows.number)]
-    velocity = None if part.velocity is None else _enu(rows.si(part.velocity), part.frame)
+    velocity = None if part.velocity is None else rows.si(part.velocity)
+    if velocity is not None:
+        velocity = velocity @ _enu_from_ecef(rows, origin).T if part.frame == "ECEF" else _enu(velocity, part.frame)
     left = _in_order(rows, part.every)
     v_WB_W = None if velocity is None else velocity[left]
     return Trajectory(rows.t_ns, R[left], p[left], v_WB_W, lookahead_s=part.lookahead_s)

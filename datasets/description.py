@@ -11,11 +11,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny, ValidationError, model_validator
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError, nearest
 from .quantities import Finite, NotNegative, Positive, Vector
+from .recording import Recording, loader
 from .rig import ImuNoise, Mounting
 from .state import LIMIT_NS, Array, Belief, NavState
 
@@ -33,10 +34,12 @@ class Part(BaseModel):
 
 
 class Table(Part):
-    """A table in a file: text, or Parquet where the name ends in .parquet."""
+    """A table in a file: text, or Parquet where the name ends in .parquet; or several NumPy arrays side by side."""
 
-    file: str
+    file: str | None = None
     """Path inside the folder of the recording."""
+    arrays: dict[str, str] = {}
+    """Instead of a file: NumPy arrays of one length, name to path; a two-dimensional one gives `name.0`, `name.1`…"""
     delimiter: str = ","
     """Between fields; "whitespace" is any run of blanks and tabs."""
     comment: str = ""
@@ -44,6 +47,12 @@ class Table(Part):
     encoding: str = "utf-8"
     header: bool = True
     """Whether the first line names the columns; without, a column is its index, from 0."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.file is None) == (not self.arrays):
+            raise ValueError("give one of `file` and `arrays`")
+        return self
 
 
 class DeviceClock(Part):
@@ -59,12 +68,12 @@ class DeviceClock(Part):
 
 
 class Message(Part):
-    """Messages of an IMC log; each field is a column, and `timestamp` is the host's stamp, s."""
+    """Messages of the recording; each field is a column, and so is what the format adds (its `host_clock`, for one)."""
 
     names: Annotated[tuple[str, ...], Field(min_length=1)]
     """Joined where their device clocks agree when there are several; columns are then `Name.field`."""
     entity: int | None = None
-    """`src_ent` of the sender; any when left out."""
+    """Which of several senders of that name: `src_ent` in IMC, the instance in ArduPilot; any when left out."""
     clock: DeviceClock | None = None
     """Adds the column `device`: this clock, unwrapped and put onto the host's, s."""
 
@@ -115,10 +124,15 @@ class Lengths(Height):
     width = 3
 
 
-class Velocity(Quantity):
-    """Three velocities."""
+class Speeds(Quantity):
+    """Any number of velocities."""
 
     units = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "kn": 1852 / 3600, "km/h": 1 / 3.6}
+
+
+class Velocity(Speeds):
+    """Three velocities."""
+
     width = 3
 
 
@@ -168,7 +182,7 @@ class Attitude(Part):
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_xyzw", "quaternion_wxyz", "roll_pitch_yaw"]
     unit: Literal["rad", "deg"] = "rad"
-    world: Literal["ENU", "NED"] = "ENU"
+    world: Literal["ENU", "NED", "ECEF"] = "ENU"
     axes: Literal["FLU", "FRD"] = "FLU"
 
     @model_validator(mode="after")
@@ -262,15 +276,13 @@ class NoiseDescription(Part):
         return ImuNoise(**self.model_dump())
 
 
-class StreamDescription(Part):
-    """What all streams have: a source of columns, a time, and rows to pass over."""
+class SourceDescription(Part):
+    """A source of columns, a time, and rows to pass over."""
 
     table: Table | None = None
     message: Message | None = None
     time: Time
     valid: Valid | None = None
-    every: Annotated[int, Field(ge=1)] = 1
-    """Keep every n-th of the rows that are left."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -279,11 +291,20 @@ class StreamDescription(Part):
         return self
 
 
+class StreamDescription(SourceDescription):
+    """What all streams have."""
+
+    every: Annotated[int, Field(ge=1)] = 1
+    """Keep every n-th of the rows that are left."""
+
+
 class ImuDescription(StreamDescription):
     """Gyro and accelerometer; each sample is taken for the mean over the interval that ends at its time."""
 
     gyro: Rate
     accel: Acceleration
+    accel_source: SourceDescription | None = None
+    """Where the accelerometer's rows are, when they are not the gyro's: interpolated linearly to the gyro's times."""
     axes: Literal["FLU", "FRD"] = "FLU"
     mounting: MountingDescription = MountingDescription()
     noise: NoiseDescription
@@ -303,13 +324,32 @@ class AidingDescription(StreamDescription):
 
 
 class DvlDescription(AidingDescription):
-    """Bottom-track velocity of the vehicle over ground, in the DVL's axes, which are the body's."""
+    """Bottom-track velocity of the vehicle over ground, in the DVL's axes, which are the body's; or a wheel's speed."""
 
     sigma_field = "sigma_m_s"
-    velocity: Velocity
+    velocity: Speeds
+    measures: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
+    """The axes that the columns of `velocity` (and of `sigma`) are; an axis left out is unmeasured: its sigma is
+    infinite."""
     axes: Literal["FLU", "FRD"] = "FLU"
-    sigma_m_s: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
-    sigma: Velocity | None = None
+    mounting: MountingDescription = MountingDescription()
+    """Turns what is measured into B's axes; its translation must be zero, since B sits in the DVL."""
+    sigma_m_s: Sigma | tuple[Sigma, ...] | None = None
+    sigma: Speeds | None = None
+
+    @model_validator(mode="after")
+    def _axes_fit(self) -> Self:
+        if len(set(self.measures)) != len(self.measures):
+            raise ValueError("measures: an axis stands there twice")
+        if len(self.velocity.columns) != len(self.measures):
+            raise ValueError(f"velocity: expected {len(self.measures)} columns, found {len(self.velocity.columns)}")
+        if isinstance(self.sigma_m_s, tuple) and len(self.sigma_m_s) != len(self.measures):
+            raise ValueError(f"sigma_m_s: expected {len(self.measures)} numbers, found {len(self.sigma_m_s)}")
+        if any(self.mounting.translation_m):
+            raise ValueError("mounting: B sits in the DVL; give the other sensors' translations from there")
+        if self.mounting != MountingDescription() and len(self.measures) < 3:
+            raise ValueError("mounting: only a velocity measured along all three axes can be turned")
+        return self
 
 
 class DepthDescription(AidingDescription):
@@ -323,13 +363,30 @@ class DepthDescription(AidingDescription):
     mounting: MountingDescription = MountingDescription()
 
 
-class GpsDescription(AidingDescription):
-    """Position of the antenna: geodetic, or in local axes, or both (a local offset from a geodetic point)."""
+class Placed(Part):
+    """A place: geodetic, or in local axes, or both (a local offset from a geodetic point); or earth-centred (ECEF)."""
 
-    sigma_field = "sigma_m"
     geodetic: Geodetic | None = None
     position: Lengths | None = None
-    frame: Literal["ENU", "NED"] = "ENU"
+    frame: Literal["ENU", "NED", "ECEF"] = "ENU"
+    """Axes of `position` (and of a truth's `velocity`); ECEF: earth-centred earth-fixed."""
+
+    @property
+    def on_the_globe(self) -> bool:
+        """Whether the place is one on the globe; else it is in W."""
+        return self.geodetic is not None or (self.position is not None and self.frame == "ECEF")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if self.geodetic is not None and self.position is not None and self.frame == "ECEF":
+            raise ValueError("ECEF positions are places by themselves: leave `geodetic` out")
+        return self
+
+
+class GpsDescription(AidingDescription, Placed):
+    """Position of the antenna."""
+
+    sigma_field = "sigma_m"
     sigma_m: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
     """East, north, up; .inf for a component that was not measured. Without a height the third is taken as .inf."""
     sigma: Lengths | None = None
@@ -367,6 +424,22 @@ class HeadingDescription(AidingDescription):
         return self
 
 
+def columns_of(part: BaseModel) -> list[Column]:
+    """Return every column that a part of a description names, in the order of its keys."""
+    found: list[Column] = []
+    for name in type(part).model_fields:
+        value = getattr(part, name)
+        if isinstance(value, Quantity | Attitude):
+            found += value.columns
+        elif isinstance(value, Geodetic):
+            found += [value.latitude, value.longitude, *columns_of(value)]
+        elif isinstance(value, Time):
+            found += [column for column in (value.column, value.received) if column is not None]
+        elif isinstance(value, Valid):
+            found.append(value.column)
+    return list(dict.fromkeys(found))
+
+
 class Streams(Part):
     """The sensors; only the IMU must be there."""
 
@@ -377,7 +450,7 @@ class Streams(Part):
     heading: HeadingDescription | None = None
 
 
-class TruthDescription(Part):
+class TruthDescription(Placed):
     """Where the vehicle was: one of a TUM file, a table of ours (`trajectory`), or a stream like the others."""
 
     kind: Literal["truth", "reference"] = "truth"
@@ -391,10 +464,6 @@ class TruthDescription(Part):
     time: Time | None = None
     valid: Valid | None = None
     every: Annotated[int, Field(ge=1)] = 1
-    geodetic: Geodetic | None = None
-    position: Lengths | None = None
-    frame: Literal["ENU", "NED"] = "ENU"
-    """Axes of `position` and `velocity`."""
     height_m: Finite | None = None
     """Height over the surface, taken as constant, where the source has no height of the vehicle."""
     velocity: Velocity | None = None
@@ -412,18 +481,6 @@ class TruthDescription(Part):
             if self.position is None and self.geodetic and self.geodetic.altitude is None and self.height_m is None:
                 raise ValueError("no height: give `geodetic.altitude` or a constant `height_m`")
         return self
-
-
-class Imc(Part):
-    """An IMC log (LSF), bare, gzipped or inside a ZIP archive."""
-
-    file: str
-    member: str | None = None
-    """Its path inside the archive."""
-    definitions: str | None = None
-    """IMC.xml or IMC.xml.gz, inside the same archive or folder; a short built-in list when left out."""
-    source: int | None = None
-    """Keep only messages with this `src`."""
 
 
 class Origin(Part):
@@ -489,16 +546,22 @@ class Description(Part):
     origin: Origin | None = None
     """W's origin. When left out and the log is geodetic, it is the first fix (of gps, else of truth) at or after the
     IMU's start, so that the vehicle starts at zero."""
-    imc: Imc | None = None
+    recording: SerializeAsAny[Recording] | None = None
+    """The one file that the streams' messages are in, by its `format`; the format's loader says what else it takes."""
     streams: Streams
     truth: TruthDescription | None = None
     prior: PriorDescription | None = None
 
+    @property
+    def parts(self) -> dict[str, StreamDescription | TruthDescription]:
+        """The streams that are there and, where it is one, the truth; by name."""
+        named = {name: getattr(self.streams, name) for name in Streams.model_fields} | {"truth": self.truth}
+        return {name: part for name, part in named.items() if part is not None}
+
     @model_validator(mode="after")
-    def _messages_have_a_log(self) -> Self:
-        parts = [*(getattr(self.streams, n) for n in Streams.model_fields), self.truth]
-        if self.imc is None and any(p is not None and p.message is not None for p in parts):
-            raise ValueError("streams name messages, but `imc` does not say which file they are in")
+    def _messages_have_a_recording(self) -> Self:
+        if self.recording is None and any(part.message is not None for part in self.parts.values()):
+            raise ValueError("streams name messages, but `recording` does not say which file they are in")
         return self
 
 
@@ -521,21 +584,37 @@ def read_description(path: Path) -> Description:
 
 def check_description(raw: dict[Any, Any], where: str) -> Description:
     """Check a parsed description; `where` stands at the head of the error."""
+    recording = raw.get("recording")
+    model: type[BaseModel] = Description
     try:
+        if isinstance(recording, dict):
+            model = _loader(recording, where)
+            raw = {**raw, "recording": model.model_validate(recording)}
+            model = Description
         return Description.model_validate(raw)
     except ValidationError as error:
-        lines = [_complaint(problem) for problem in error.errors(include_url=False)]
+        above = () if model is Description else ("recording",)
+        lines = [_complaint(problem, model, above) for problem in error.errors(include_url=False)]
         raise DatasetError(f"{where}: " + f"\n{where}: ".join(dict.fromkeys(lines))) from None
     except (RecursionError, OverflowError) as error:
         raise DatasetError(f"{where}: cannot be understood: {error}") from None
 
 
-def _complaint(problem: Any) -> str:
-    """Turn one of pydantic's errors into a sentence with the key's path."""
+def _loader(recording: dict[Any, Any], where: str) -> type[Recording]:
+    if "format" not in recording:
+        raise DatasetError(f"{where}: missing key `recording.format`")
+    try:
+        return loader(recording["format"])
+    except DatasetError as error:
+        raise DatasetError(f"{where}: `recording.format`: {error}") from None
+
+
+def _complaint(problem: Any, model: type[BaseModel], above: tuple[str, ...]) -> str:
+    """Turn one of pydantic's errors into a sentence with the key's path; `model` stands at `above`."""
     loc: tuple[Any, ...] = problem["loc"]
-    path = ".".join(str(step) for step in loc) or "top level"
+    path = ".".join(str(step) for step in (*above, *loc)) or "top level"
     if problem["type"] == "extra_forbidden":
-        known = _known_keys(loc[:-1])
+        known = _known_keys(loc[:-1], model)
         return f"unknown key `{path}`{nearest(str(loc[-1]), known)} (known: {', '.join(known)})"
     if problem["type"] == "missing":
         return f"missing key `{path}`"
@@ -544,9 +623,8 @@ def _complaint(problem: Any) -> str:
     return f"`{path}`: {message}{found}"
 
 
-def _known_keys(loc: tuple[Any, ...]) -> list[str]:
-    """Return the keys of the model that stands at `loc`."""
-    model: type[BaseModel] = Description
+def _known_keys(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
+    """Return the keys of the model that stands at `loc` under `model`."""
     for step in loc:
         info = model.model_fields.get(str(step))
         if info is None:

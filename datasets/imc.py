@@ -10,20 +10,18 @@ import gzip
 import xml.etree.ElementTree as ET
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, ClassVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .columns import Columns
-from .description import Imc, Message
 from .errors import DatasetError, nearest
-from .state import Array
+from .recording import Held, Messages, Recording, Wanted, not_held
 
 HEADER = np.dtype(
     [("sync", "<u2"), ("id", "<u2"), ("size", "<u2"), ("timestamp", "<f8"), ("src", "<u2"), ("src_ent", "u1"),
@@ -97,6 +95,73 @@ def parse_definitions(xml: bytes, where: str) -> dict[str, Layout]:
     return layouts
 
 
+class ImcRecording(Recording):
+    """An IMC log (LSF), bare, gzipped or inside a ZIP archive. A message's sender is its `src_ent`."""
+
+    host_clock: ClassVar = ("timestamp", "s")
+
+    member: str | None = None
+    """Its path inside the archive."""
+    definitions: str | None = None
+    """IMC.xml or IMC.xml.gz, inside the same archive or folder; a short built-in list when left out."""
+    source: int | None = None
+    """Keep only messages with this `src`."""
+
+    def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
+        """Read the messages asked for; see `Recording.read`."""
+        where = str(folder / self.file)
+        layouts = self._layouts(folder)
+        for want in wanted:
+            if want.message not in layouts:
+                hint = nearest(want.message, layouts)
+                raise DatasetError(f"{where}: unknown IMC message {want.message!r}{hint}")
+        with _opened(folder, self.file, self.member) as stream:
+            held = scan(stream, {want.message: layouts[want.message] for want in wanted}, self.source, where)
+        return Messages([_columns(held.rows[want.message], want, where) for want in wanted], held.notes)
+
+    def contents(self, folder: Path) -> list[Held]:
+        """Return the messages that the log holds, by name and entity."""
+        layouts = self._layouts(folder)
+        with _opened(folder, self.file, self.member) as stream:
+            held = scan(stream, layouts, self.source, str(folder / self.file))
+        found = []
+        for name, rows in held.rows.items():
+            fields = tuple(n for n in rows.dtype.names or () if n not in ("timestamp", "src_ent"))
+            for entity in np.unique(rows["src_ent"]).tolist():
+                stamps = rows["timestamp"][rows["src_ent"] == entity]
+                found.append(Held(name, "", len(stamps), float(np.ptp(stamps)), fields, entity))
+        return sorted(found, key=lambda h: (h.message, h.sender or 0))
+
+    def _layouts(self, folder: Path) -> dict[str, Layout]:
+        """Return the message layouts of the log: its own definitions, else the built-in ones."""
+        if self.definitions is None:
+            return built_in_layouts()
+        in_archive = self.file.endswith(".zip")
+        file, member = (self.file, self.definitions) if in_archive else (self.definitions, None)
+        where = f"{folder / file}: {self.definitions}"
+        with _opened(folder, file, member) as stream:
+            try:
+                xml = stream.read()
+            except BROKEN as error:
+                raise DatasetError(f"{where}: cannot be read: {error}") from None
+        return parse_definitions(xml, where)
+
+
+def _columns(rows: NDArray[Any], want: Wanted, where: str) -> dict[str, NDArray[Any]]:
+    """Return the columns asked for, of the entity asked for, as float64."""
+    if want.sender is not None:
+        entities = sorted(set(rows["src_ent"].tolist()))
+        rows = rows[rows["src_ent"] == want.sender]
+        if not len(rows):
+            raise DatasetError(f"{where}: no {want.message} from entity {want.sender}; it comes from {entities}")
+    if not len(rows):
+        raise DatasetError(f"{where}: no {want.message} in the log")
+    for column in want.columns:
+        if column not in (rows.dtype.names or ()):
+            raise not_held(where, f"field of {want.message} called", column, rows.dtype.names or ())
+    return {column: rows[column].astype(float) for column in want.columns}
+
+
 @contextmanager
 def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
     """Open a file, or a member of an archive, as a stream of bytes; gunzipped where its name ends in .gz."""
@@ -127,35 +192,6 @@ def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
     finally:
         if archive is not None:
             archive.close()
-
-
-def read_layouts(folder: Path, imc: Imc) -> dict[str, Layout]:
-    """Return the message layouts of a log: its own definitions, else the built-in ones."""
-    if imc.definitions is None:
-        return built_in_layouts()
-    in_archive = imc.file.endswith(".zip")
-    file, member = (imc.file, imc.definitions) if in_archive else (imc.definitions, None)
-    where = f"{folder / file}: {imc.definitions}"
-    with _opened(folder, file, member) as stream:
-        try:
-            xml = stream.read()
-        except BROKEN as error:
-            raise DatasetError(f"{where}: cannot be read: {error}") from None
-    return parse_definitions(xml, where)
-
-
-def read_lsf(folder: Path, imc: Imc, names: list[str]) -> LsfRead:
-    """Read the messages called `names`, from the source the description asks for.
-
-    Raises:
-        DatasetError: no such file or message, or not one whole message in it.
-    """
-    layouts = read_layouts(folder, imc)
-    for name in names:
-        if name not in layouts:
-            raise DatasetError(f"{folder / imc.file}: unknown IMC message {name!r}{nearest(name, layouts)}")
-    with _opened(folder, imc.file, imc.member) as stream:
-        return scan(stream, {name: layouts[name] for name in names}, imc.source, str(folder / imc.file))
 
 
 def scan(stream: IO[bytes], layouts: Mapping[str, Layout], source: int | None, where: str) -> LsfRead:
@@ -272,76 +308,3 @@ def _messages(data, final, in_gap, table):  # pragma: no cover  (compiled)
         at += 1
         skipped += 1
     return offsets[:found], at, gaps, skipped, in_gap
-
-
-def message_columns(read: LsfRead, message: Message, where: str) -> Columns:
-    """Return the columns of one description of messages: fields, `timestamp`, and `device` where it has a clock.
-
-    Raises:
-        DatasetError: no such message from this entity, or no such field.
-    """
-    parts = []
-    for name in message.names:
-        rows = read.rows[name]
-        if message.entity is not None:
-            entities = sorted(set(rows["src_ent"].tolist()))
-            rows = rows[rows["src_ent"] == message.entity]
-            if not len(rows):
-                raise DatasetError(f"{where}: no {name} from entity {message.entity}; it comes from {entities}")
-        if not len(rows):
-            raise DatasetError(f"{where}: no {name} in the log")
-        if message.clock is not None and message.clock.field not in (rows.dtype.names or ()):
-            raise DatasetError(f"{where}: {name} has no field {message.clock.field!r}")
-        parts.append(rows)
-    device: Array | None = None
-    if message.clock is not None:
-        field, wraps_at_s = message.clock.field, message.clock.wraps_at_s
-        unwrapped = [unwrap(part["timestamp"], part[field].astype(float), wraps_at_s) for part in parts]
-        keys = [np.where(np.isfinite(u), np.rint(u * 1e6), -1.0).astype(np.int64) for u in unwrapped]
-        rows = [np.unique(k, return_index=True)[1] for k in keys]
-        common = keys[0][rows[0]]
-        for k, row in zip(keys[1:], rows[1:], strict=True):
-            common = np.intersect1d(common, k[row])
-        if len(parts) > 1:
-            picks = [row[np.isin(k[row], common)] for k, row in zip(keys, rows, strict=True)]
-            parts = [part[pick] for part, pick in zip(parts, picks, strict=True)]
-            unwrapped = [unwrapped[0][picks[0]]]
-        if not len(parts[0]):
-            raise DatasetError(f"{where}: {' and '.join(message.names)} have no device time in common")
-        device = onto_host(parts[0]["timestamp"], unwrapped[0])
-    columns: Columns = {"timestamp": parts[0]["timestamp"].astype(float)}
-    if device is not None:
-        columns["device"] = device
-    for name, part in zip(message.names, parts, strict=True):
-        prefix = f"{name}." if len(parts) > 1 else ""
-        for field in part.dtype.names or ():
-            columns.setdefault(prefix + field, part[field].astype(float))
-    return columns
-
-
-def unwrap(host_s: Array, device_s: Array, wraps_at_s: float) -> Array:
-    """Return the device clock without its jumps, counted by the host's clock; they may disagree by half a lap."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        laps = np.rint(((host_s - host_s[0]) - (device_s - device_s[0])) / wraps_at_s)
-        unwrapped = device_s + laps * wraps_at_s
-    return np.where(np.abs(unwrapped) < 1e12, unwrapped, np.nan)
-
-
-def onto_host(host_s: Array, device_s: Array, window_s: float = 10.0) -> Array:
-    """Return the device's times on the host's clock: offset and drift from the smallest delays of each window.
-
-    The device clock is exact but runs at its own rate (1.1e-3 fast has been met); a reception is late by something that
-    is sometimes nearly nothing. So a line is fitted to the smallest host − device of each window.
-    """
-    good = np.isfinite(device_s) & np.isfinite(host_s) & (np.abs(host_s) < 1e12)
-    if not good.any():
-        return np.full_like(device_s, np.nan)
-    start = device_s[good][0]
-    since, late = device_s[good] - start, host_s[good] - device_s[good]
-    window = np.floor(since / window_s).astype(np.int64)
-    order = np.lexsort((late, window))
-    first = order[np.unique(window[order], return_index=True)[1]]
-    if len(first) < 3:
-        return device_s + late.min()
-    line = np.polynomial.Polynomial.fit(since[first], late[first], 1)
-    return device_s + line(device_s - start)

@@ -14,7 +14,8 @@ import pytest
 import yaml
 from fathom.datasets import DatasetError, Log
 from fathom.datasets import imc as imc_module
-from fathom.datasets.imc import CRC_TABLE, Layout, built_in_layouts, onto_host, parse_definitions, scan, unwrap
+from fathom.datasets.device_clock import onto_host, unwrap
+from fathom.datasets.imc import CRC_TABLE, Layout, built_in_layouts, parse_definitions, scan
 from fathom.datasets.opening import open_log
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -53,7 +54,7 @@ def small_log(n: int = 60) -> list[bytes]:
 
 
 DESCRIPTION: dict[str, Any] = {
-    "imc": {"file": "Data.lsf", "source": 27},
+    "recording": {"format": "imc", "file": "Data.lsf", "source": 27},
     "streams": {
         "imu": {
             "message": {"names": ["AngularVelocity", "Acceleration"], "entity": 65,
@@ -102,7 +103,7 @@ def test_streams_come_out_of_messages_in_our_frames(folder):
 @pytest.mark.parametrize("how", ["lsf", "gz", "zip", "zip-gz"])
 def test_an_lsf_reads_the_same_bare_gzipped_and_out_of_an_archive(folder, how):
     data = (folder / "Data.lsf").read_bytes()
-    imc: dict[str, Any] = {"source": 27, "file": "Data.lsf"}
+    imc: dict[str, Any] = {"format": "imc", "source": 27, "file": "Data.lsf"}
     if how == "gz":
         (folder / "Data.lsf.gz").write_bytes(gzip.compress(data))
         imc["file"] = "Data.lsf.gz"
@@ -111,7 +112,7 @@ def test_an_lsf_reads_the_same_bare_gzipped_and_out_of_an_archive(folder, how):
         with zipfile.ZipFile(folder / "a.zip", "w") as archive:
             archive.writestr(imc["member"], gzip.compress(data) if how == "zip-gz" else data)
     before = open_log(folder)
-    (folder / "log.yaml").write_text(yaml.safe_dump({**DESCRIPTION, "imc": imc}))
+    (folder / "log.yaml").write_text(yaml.safe_dump({**DESCRIPTION, "recording": imc}))
     np.testing.assert_array_equal(open_log(folder).imu.t_ns, before.imu.t_ns)
 
 
@@ -161,10 +162,10 @@ def test_junk_is_no_log():
         (
             ("streams", "depth", "depth"),
             {"columns": ["valu"], "unit": "m"},
-            "Depth has no 'valu'; did you mean 'value'",
+            "no field of Depth called 'valu'; did you mean 'value'",
         ),
-        (("imc", "file"), "Dat.lsf", "no such file; did you mean 'Data.lsf'"),
-        (("imc", "source"), 28, "no AngularVelocity"),
+        (("recording", "file"), "Dat.lsf", "no such file; did you mean 'Data.lsf'"),
+        (("recording", "source"), 28, "no AngularVelocity"),
     ],
 )
 def test_what_is_not_in_the_log_is_named(folder, path, value, error):
@@ -219,8 +220,10 @@ def test_a_damaged_archive_gives_a_log_or_an_error(folder, at, junk, kind):
     raw = bytearray(buffer.getvalue() if kind == "zip" else gzip.compress(data))
     raw[at % len(raw) : at % len(raw) + len(junk)] = junk
     (folder / f"Data.lsf.{kind}").write_bytes(bytes(raw))
-    imc = {"file": f"Data.lsf.{kind}", "source": 27} | ({"member": "Data.lsf"} if kind == "zip" else {})
-    (folder / "log.yaml").write_text(yaml.safe_dump({**DESCRIPTION, "imc": imc}))
+    imc = {"format": "imc", "file": f"Data.lsf.{kind}", "source": 27} | (
+        {"member": "Data.lsf"} if kind == "zip" else {}
+    )
+    (folder / "log.yaml").write_text(yaml.safe_dump({**DESCRIPTION, "recording": imc}))
     try:
         log = open_log(folder, repair=True)
     except DatasetError:
