@@ -77,8 +77,12 @@ def run(
         str | None, typer.Option(help="Pattern: an estimator's label, a log's name, or \"log/label\".")
     ] = None,
     repair: Repair = False,
+    force: Annotated[bool, typer.Option("--force", help="Run again what is done already.")] = False,
 ) -> None:
-    """Run every estimator of EXPERIMENT on every one of its logs, and print the tables."""
+    """Run every estimator of EXPERIMENT on every one of its logs, and print the tables.
+
+    What an earlier `fathom run` finished is not run again, unless its spec, its log, or the version has changed.
+    """
     with refusing_bad_input():
         from .experiment import Experiment
         from .runner import run_experiment
@@ -86,9 +90,9 @@ def run(
         plan = Experiment.load(experiment)
         folder = out / plan.name
         try:
-            rows = run_experiment(plan, data, out, jobs, only, repair)
+            rows = run_experiment(plan, data, out, jobs, only, repair, force)
         except KeyboardInterrupt:
-            _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}")
+            _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}; the same command does the rest")
             raise typer.Exit(INTERRUPTED) from None
         _present(rows, plan, folder)
     statuses = set(rows.loc[~rows["log"].isin(rows.attrs["kept"]), "status"])
@@ -115,6 +119,11 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
         raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
     _say(f"{folder}: runs.sqlite, table.csv, consistency.csv, {len(figures)} figures")
     print_table(rows)
+    standing, renewed = rows.attrs["standing"], rows.attrs["renewed"]
+    if standing:
+        _say(f"{standing} runs were done already; --force does them again")
+    if renewed:
+        _say(f"{renewed} runs were done under another spec, log or version, and made anew")
     for log, cause in rows.attrs["kept"].items():
         _say(f"{log}: {cause}; its rows are from an earlier run")
 

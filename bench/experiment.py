@@ -6,6 +6,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -68,6 +69,11 @@ class LogSpec:
         scenario = Scenario.from_dict(self.scenario or {})
         return f"{scenario.mission}-{scenario.imu}" if isinstance(scenario.imu, str) else scenario.mission
 
+    @cached_property
+    def source(self) -> Any:
+        """What a run's spec says of the log: where it is, or the scenario with every default."""
+        return self.log or plain(Scenario.from_dict(self.scenario or {}))
+
     @property
     def duration_s(self) -> float | None:
         """How long a simulated log is; None for a recorded one, which must be opened to know."""
@@ -121,6 +127,11 @@ class EstimatorSpec:
         if not self.label:
             object.__setattr__(self, "label", self.name)
         return self
+
+    @cached_property
+    def config(self) -> Any:
+        """What a run's spec says of the estimator's options: every one, defaults included."""
+        return plain(self.create())
 
     def create(self) -> Estimator:
         """Return the configured estimator.
@@ -230,12 +241,11 @@ class Experiment:
 
     def spec(self, run: Run, repair: bool = False) -> dict[str, Any]:
         """Return all that decides a run's numbers, as JSON can hold it: defaults included."""
-        source = run.log.log or plain(Scenario.from_dict(run.log.scenario or {}))
         return {
-            "log": source,
+            "log": run.log.source,
             "log_sha256": run.log.description_sha256,
             "repair": repair,
-            "estimator": {"name": run.estimator.name, "config": plain(run.estimator.create())},
+            "estimator": {"name": run.estimator.name, "config": run.estimator.config},
             "seed": run.seed,
             "scores": plain(self.scoring(run.log)),
             "max_gap_s": self.max_gap_s,

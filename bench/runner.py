@@ -13,9 +13,10 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatch
+from functools import cached_property
 from hashlib import sha256
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
@@ -34,6 +35,7 @@ from .consistency import nees_at
 from .experiment import Experiment, ExperimentError, Run, plain
 from .floor import Floor, floors
 from .floor_ratio import FLOORS, floor_scores
+from .ledger import content_sha256, identity, sole_writer
 from .metrics import ScoreError
 from .run import Result, can_judge, costs, innovation_dof, innovation_scores, run_log, scores, warm_up
 from .store import Row, Store, provenance
@@ -55,6 +57,18 @@ class Task:
     folder: Path
     data: Path | None = None
     repair: bool = False
+    readings_sha256: str | None = None
+    """Of a recorded log; see `ledger.identity`."""
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """All that decides the run's numbers but readings and versions."""
+        return self.experiment.spec(self.run, self.repair)
+
+    @cached_property
+    def identity(self) -> str:
+        """What tells this run from any other."""
+        return identity(self.spec, self.readings_sha256)
 
     def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
         """Return what a row says whether the run succeeds or not."""
@@ -70,7 +84,8 @@ class Task:
             "align": scoring.align,
             "dims": scoring.dims,
             "estimator": run.estimator.name,
-            "spec": json.dumps(self.experiment.spec(run, self.repair)),
+            "identity": self.identity,
+            "spec": json.dumps(self.spec),
             "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         } | provenance()
 
@@ -82,12 +97,15 @@ def run_experiment(
     jobs: int = 0,
     only: str | None = None,
     repair: bool = False,
+    force: bool = False,
 ) -> pd.DataFrame:
     """Run every estimator on every log and return the rows of the store, one per run and output.
 
-    A run that fails, diverges, or kills its worker is a row that says so. Interrupted (KeyboardInterrupt), the finished
-    runs are in the store. A run whose recording is not here keeps the rows of an earlier day; `attrs["kept"]` then maps
-    its log to why it did not run.
+    What is in the store already, under its `ledger.identity`, is not run again: `attrs["standing"]` says how many runs
+    that were, `attrs["renewed"]` how many stood there under another identity and were made anew. A run that fails,
+    diverges, or kills its worker is a row that says so. Interrupted (KeyboardInterrupt), the finished runs are in the
+    store. A run whose recording is not here keeps the rows of an earlier day; `attrs["kept"]` then maps its log to why
+    it did not run.
 
     Args:
         experiment: an experiment, a shipped one's name, or a YAML file.
@@ -96,6 +114,7 @@ def run_experiment(
         jobs: worker processes; 0 for one per core.
         only: run only what matches this pattern: an estimator's label, a log's name, or "log/label".
         repair: let loaders drop bad rows, and count them.
+        force: run what is in the store already, too.
 
     Raises:
         ExperimentError, EstimatorError, DatasetError: nothing was run.
@@ -108,15 +127,38 @@ def run_experiment(
     runs = _select(experiment, only)
     tasks, absent = _order([Task(experiment, run, folder, Path(data) if data else None, repair) for run in runs])
     _make_room(folder)
-    with Store(folder / "runs.sqlite") as store:
+    with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
-        with _progress(len(tasks)) as advance:
-            for rows in run_all(tasks, jobs):
+        missing, renewed = _missing(tasks, store, force)
+        with _progress(len(missing), len(tasks) - len(missing)) as advance:
+            for rows in run_all(missing, jobs):
                 store.write(rows)
                 advance(rows)
+        _sweep(folder / "trajectories", store.trajectories())
         rows = rows_of(store.read(), runs)
-    rows.attrs["kept"] = kept
+    rows.attrs |= {"kept": kept, "standing": len(tasks) - len(missing), "renewed": renewed}
     return rows
+
+
+def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Task], int]:
+    """Return the tasks that are not in the store yet, and how many of them stand there under another identity."""
+    finished = store.finished()
+    named = {key[:3] for key in finished}
+    missing, renewed = [], 0
+    for task in tasks:
+        names = (task.run.log.name, task.run.estimator.label, task.run.seed)
+        stands = (*names, task.identity) in finished
+        if force or not stands:
+            missing.append(task)
+            renewed += names in named and not stands
+    return missing, renewed
+
+
+def _sweep(folder: Path, spoken_of: set[str]) -> None:
+    """Remove what runs that were killed or made anew left behind."""
+    for path in folder.iterdir():
+        if path.name not in spoken_of and (path.suffix == ".parquet" or ".parquet." in path.name):
+            path.unlink(missing_ok=True)
 
 
 def _make_room(folder: Path) -> None:
@@ -125,7 +167,7 @@ def _make_room(folder: Path) -> None:
     Raises:
         ExperimentError: they cannot be made, or something else is where a result will go.
     """
-    for path in (folder / "trajectories", folder / "figures"):
+    for path in (folder / "trajectories", folder / "figures"):  # the lock lies in their parent
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -156,14 +198,23 @@ def _order(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]]]:
     of the others.
     """
     duration_s: dict[str, float] = {}
+    readings: dict[str, str] = {}
     missing: dict[str, str] = {}
     for task in {task.run.log.name: task for task in tasks}.values():
         spec = task.run.log
         try:
-            duration_s[spec.name] = spec.duration_s or spec.open(None, task.data, task.repair).duration_s
+            if spec.duration_s is None:
+                log = spec.open(None, task.data, task.repair)
+                duration_s[spec.name], readings[spec.name] = log.duration_s, content_sha256(log)
+            else:
+                duration_s[spec.name] = spec.duration_s
         except RecordingNotFound as error:
             missing[spec.name] = f"not here: {error}"
-    here = [task for task in tasks if task.run.log.name in duration_s]
+    here = [
+        replace(task, readings_sha256=readings.get(task.run.log.name))
+        for task in tasks
+        if task.run.log.name in duration_s
+    ]
     absent = [task.row("absent", missing[task.run.log.name]) for task in tasks if task.run.log.name in missing]
 
     def longest(task: Task) -> tuple[float, str, int, float]:
@@ -294,7 +345,7 @@ def _single_threaded_children() -> Iterator[None]:
 
 
 @contextmanager
-def _progress(total: int) -> Iterator[Any]:
+def _progress(missing: int, standing: int) -> Iterator[Any]:
     """Give a function to call with each finished run's rows; draws a bar on a terminal, nothing elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -307,7 +358,7 @@ def _progress(total: int) -> Iterator[Any]:
         TextColumn("{task.description}", markup=False),
     )
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("", total=total)
+        task = bar.add_task("", total=missing + standing, completed=standing)
 
         def advance(rows: Sequence[Row]) -> None:
             bar.update(task, advance=1, description=f"{rows[0]['log']} / {rows[0]['label']}: {rows[0]['status']}")
@@ -433,10 +484,17 @@ def log_key(task: Task) -> str:
 
 
 def save(task: Task, output: str, trajectory: Trajectory) -> str:
-    """Write a trajectory beside the store and return its file's name; of the covariance, the 3 × 3 blocks."""
+    """Write a trajectory beside the store and return its file's name; of the covariance, the 3 × 3 blocks.
+
+    The name ends in the identity of the run (of the content, for the truth, which runs share): so a file is never
+    written over with another's content, and a row that stands keeps its own.
+    """
     label = task.run.estimator.label if output != "truth" else ""
     seed = "" if task.run.seed is None else str(task.run.seed)
-    name = "--".join(_file_part(part) for part in (task.run.log.name, label, seed, output) if part) + ".parquet"
+    mark = (content_sha256(trajectory) if output == "truth" else task.identity)[:8]
+    name = "--".join(_file_part(part) for part in (task.run.log.name, label, seed, output, mark) if part) + ".parquet"
+    if output == "truth" and (task.folder / "trajectories" / name).is_file():
+        return name
     table = trajectory.to_pandas()
     across = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15) if i // 3 != j // 3]
     table = table.drop(columns=across, errors="ignore")

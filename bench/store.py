@@ -10,7 +10,6 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,13 @@ import pandas as pd
 
 from .experiment import ExperimentError
 from .floor_ratio import FLOORS
+from .ledger import FINAL, versions
 from .run import COSTS, INNOVATIONS, SCORES
 
 Row = Mapping[str, Any]
 
-IDENTITY = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER", "output": "TEXT"}
-"""What tells rows apart: seed is NULL for a recorded log; output is "online" or "hindsight"."""
+NAMES = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER", "output": "TEXT"}
+"""What a row is called: seed is NULL for a recorded log; output is "online" or "hindsight"."""
 
 OUTCOME = {
     "status": "TEXT",  # done, diverged, failed, absent
@@ -40,6 +40,7 @@ HONESTY = {
     "nis_dof": "TEXT",  # JSON: degrees of freedom of each sensor's NIS
 }
 ORIGIN = {
+    "identity": "TEXT",  # see `ledger.identity`
     "estimator": "TEXT",
     "spec": "TEXT",  # JSON
     "counts": "TEXT",  # JSON
@@ -52,7 +53,7 @@ ORIGIN = {
     "versions": "TEXT",  # JSON
     "machine": "TEXT",  # JSON
 }
-COLUMNS = IDENTITY | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | ORIGIN
+COLUMNS = NAMES | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | ORIGIN
 RENAMED = {"anees_position": "nees_position"}
 """Columns that an older version called otherwise."""
 SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"
@@ -104,7 +105,7 @@ class Store:
         try:
             with self.connection:
                 for row in rows:
-                    self.connection.execute(f"DELETE FROM runs WHERE {SAME_RUN}", {key: row[key] for key in IDENTITY})
+                    self.connection.execute(f"DELETE FROM runs WHERE {SAME_RUN}", {key: row[key] for key in NAMES})
                 for row in rows:
                     names = ", ".join(row)
                     values = ", ".join(f":{name}" for name in row)
@@ -114,12 +115,23 @@ class Store:
 
     def write_absent(self, row: Row) -> bool:
         """Add the row of a run that could not be made; return False, and do nothing, where an earlier one left rows."""
-        run = {key: row[key] for key in IDENTITY}
+        run = {key: row[key] for key in NAMES}
         found = self.connection.execute(f"SELECT 1 FROM runs WHERE {SAME_RUN} AND status IS NOT 'absent'", run)
         if found.fetchone():
             return False
         self.write([row])
         return True
+
+    def finished(self) -> set[tuple[str, str, int | None, str]]:
+        """Return log, label, seed and identity of every run that came to an end that counts."""
+        final = ", ".join(f"'{status}'" for status in FINAL)
+        query = f"SELECT DISTINCT log, label, seed, identity FROM runs WHERE status IN ({final}) AND identity NOT NULL"
+        return set(self.connection.execute(query))
+
+    def trajectories(self) -> set[str]:
+        """Return the names of the trajectory files that rows speak of."""
+        query = "SELECT trajectory FROM runs UNION SELECT truth_trajectory FROM runs"
+        return {name for (name,) in self.connection.execute(query) if name is not None}
 
     def read(self) -> pd.DataFrame:
         """Return every row, in the order in which they were written."""
@@ -172,17 +184,7 @@ def provenance() -> dict[str, str]:
         "platform": platform.platform(),
         "node": platform.node(),
     }
-    return {"commit_id": _commit(), "versions": json.dumps(_versions()), "machine": json.dumps(machine)}
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for package in ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas"):
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "absent"
-    return found
+    return {"commit_id": _commit(), "versions": json.dumps(versions()), "machine": json.dumps(machine)}
 
 
 def _commit() -> str:
@@ -194,7 +196,7 @@ def _commit() -> str:
         describe = [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
         return subprocess.run(describe, capture_output=True, check=True, text=True, timeout=20).stdout.strip()
     except (OSError, subprocess.SubprocessError):
-        return f"fathom-bench {_versions()['fathom-bench']}"
+        return f"fathom-bench {versions()['fathom-bench']}"
 
 
 def _cpu_model() -> str:

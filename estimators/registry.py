@@ -64,6 +64,12 @@ def _plugins() -> dict[str, EntryPoint]:
     return {point.name: point for point in entry_points(group="fathom.estimators")}
 
 
+def package_of(name: str) -> str | None:
+    """Return the package and version that an estimator comes from; None for ours."""
+    point = None if name in ESTIMATORS else _plugins().get(name)
+    return None if point is None or point.dist is None else f"{point.dist.name} {point.dist.version}"
+
+
 def create(name: str, /, **options: Any) -> Estimator:
     """Return the estimator `name`, configured.
 
