@@ -439,7 +439,7 @@ class Bench:
             return dict.fromkeys(FLOORS)
         assert run.seed is not None
         factors = run.estimator.create().factors
-        key = f"{log_key(task)} {sorted(factors)}"
+        key = f"{log_key(task)} {sorted(factors)} {scoring.score_period_s} {experiment.max_gap_s}"
         if lookahead_s not in self.floors.get(key, {}):
             lags = {getattr(estimator.create(), "lag_s", 0.0) for estimator in experiment.estimators}
             scenario = Scenario.from_dict(run.log.scenario or {})
