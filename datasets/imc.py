@@ -99,6 +99,7 @@ class ImcRecording(Recording):
     """An IMC log (LSF), bare, gzipped or inside a ZIP archive. A message's sender is its `src_ent`."""
 
     host_clock: ClassVar = ("timestamp", "s")
+    suffixes: ClassVar = (".lsf", ".lsf.gz")
 
     member: str | None = None
     """Its path inside the archive."""

@@ -76,6 +76,8 @@ class Recording(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
     host_clock: ClassVar[tuple[str, str]]
     """The column of the host's stamps that every message of this format has, and its unit (s, ms, us or ns)."""
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    """How the names of such files end, in small letters."""
 
     format: str
     file: str
@@ -134,6 +136,15 @@ def loader(name: object) -> type[Recording]:
         package = point.dist.name if point.dist else point.value
         what = " ".join(f"{type(error).__name__}: {error}".split())
         raise DatasetError(f"format {name!r}: cannot be loaded from the package {package!r}: {what}") from error
+
+
+def recording_at(path: Path) -> Recording | None:
+    """Return the loader of a file that nobody has described, by how its name ends; None where that tells nothing."""
+    for name in known_formats():
+        kind = loader(name)
+        if path.name.lower().endswith(kind.suffixes or ("\0",)):
+            return kind(format=name, file=path.name)
+    return None
 
 
 def _plugins() -> dict[str, EntryPoint]:

@@ -1,0 +1,24 @@
+"""What a recording holds that nobody has described yet: its messages, how often they come, and their fields."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from ...datasets.recording import Held
+
+
+def print_contents(held: Sequence[Held], console: Console) -> None:
+    """Print one row per kind of message; the fields are the columns that a log.yaml can name."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for heading in ("message", "type", "from", "n", "Hz", "fields"):
+        table.add_column(heading, justify="right" if heading in ("from", "n", "Hz") else "left", overflow="fold")
+    for each in held:
+        rate = f"{(each.count - 1) / each.span_s:.2f}" if each.span_s > 0 else "–"
+        sender = "" if each.sender is None else str(each.sender)
+        table.add_row(each.message, each.kind, sender, f"{each.count:,}", rate, " ".join(each.fields))
+    console.print(table)
+    console.print("No log.yaml describes it yet: docs/your-own-log.md shows how.", highlight=False)
