@@ -172,7 +172,7 @@ def linearise(
     heard = [stream.t_ns for sensor, stream in log.streams.items() if sensor in factors]
     voyage = cut(log, np.unique(np.concatenate([ticks_ns, *heard])), factors, max_gap_s)
     t_ns = np.array([voyage.start_ns, *(epoch.t_ns for epoch in voyage.epochs)])
-    x, rig = true_states(truth, t_ns), compile_rig(log.rig, factors, {})
+    x, rig = true_states(truth, t_ns), compile_rig(log.rig, factors, {}, log.rig.latitude_deg is not None)
     F, Q = motions(voyage.epochs, x, rig)
 
     readings = np.concatenate([np.zeros(0, READING), *(epoch.readings for epoch in voyage.epochs)])

@@ -217,10 +217,16 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
             for name in ("depth", "gps", "heading")
             if (part := getattr(streams, name)) is not None
         }
-        rig = Rig(streams.imu.noise.noise(), streams.imu.mounting.mounting(), **mountings, gravity=description.gravity)
-    degrees = None if origin is None else (float(np.degrees(origin[0])), float(np.degrees(origin[1])))
-    if description.origin is not None:
-        degrees = (description.origin.latitude_deg, description.origin.longitude_deg)
+        degrees = None if origin is None else (float(np.degrees(origin[0])), float(np.degrees(origin[1])))
+        if description.origin is not None:
+            degrees = (description.origin.latitude_deg, description.origin.longitude_deg)
+        rig = Rig(
+            streams.imu.noise.noise(),
+            streams.imu.mounting.mounting(),
+            **mountings,
+            gravity=description.gravity,
+            latitude_deg=None if degrees is None else degrees[0],
+        )
     log = Log(
         name=description.name or folder.resolve().name,
         rig=rig,

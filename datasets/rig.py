@@ -1,13 +1,17 @@
-"""The rig: where every sensor sits on the body, how noisy it is, and how strong gravity is."""
+"""The rig: where every sensor sits on the body, how noisy it is, and what gravity and the Earth's turning are there."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from .errors import DatasetError
 from .state import Array
+
+EARTH_RATE_RADPS = 7.292115e-5
+"""WGS 84: 15.04 °/h."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,7 @@ class Rig:
         imu_noise: its densities and bias figures.
         depth, gps, heading: mountings of the pressure sensor P, the GPS antenna G, the heading sensor H.
         gravity: m/s², positive; g_W = (0, 0, −gravity).
+        latitude_deg: of W's origin; None where it is not known (or, simulated, where the Earth does not turn).
     """
 
     imu_noise: ImuNoise
@@ -59,7 +64,25 @@ class Rig:
     gps: Mounting = field(default_factory=Mounting)
     heading: Mounting = field(default_factory=Mounting)
     gravity: float = 9.81
+    latitude_deg: float | None = None
 
     def __post_init__(self) -> None:
         if not 9.7 < self.gravity < 9.9:
             raise DatasetError(f"rig: gravity must be in m/s² and positive, found {self.gravity}")
+        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
+            raise DatasetError(f"rig: latitude_deg must lie between −90 and 90, found {self.latitude_deg}")
+
+    @property
+    def w_CW_W(self) -> Array:  # noqa: N802 - a rate, in our notation
+        """Rate at which the Earth turns W over the celestial frame C, that of the stars, (3,) rad/s.
+
+        Raises:
+            DatasetError: the latitude is not known.
+        """
+        if self.latitude_deg is None:
+            raise DatasetError(
+                "rig: no latitude, so how the Earth turns W is not known; give `origin` in log.yaml, or `latitude_deg` "
+                "in a scenario, or leave `earth_rotation` out"
+            )
+        latitude = math.radians(self.latitude_deg)
+        return EARTH_RATE_RADPS * np.array([0.0, math.cos(latitude), math.sin(latitude)])

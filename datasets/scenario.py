@@ -16,14 +16,12 @@ from .errors import DatasetError, nearest
 from .faults import AnyFaults, DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults, true_mounting
 from .imu_grades import IMU_GRADES
 from .mission import MISSIONS, RECORDED
-from .quantities import DEGREE, STRICT, Finite, NotNegative, Positive, Probability, Vector
+from .quantities import STRICT, Finite, NotNegative, Positive, Probability, Vector
 from .rig import ImuNoise, Mounting, Rig
 from .sea import TideSpec, WavesSpec
 from .seabed import SeabedSpec
 from .state import Array
 
-EARTH_RATE_RADPS = 7.292115e-5
-"""WGS 84: 15.04 °/h."""
 CLEARANCE_M = 0.5
 """Least height of a mission's deepest point above the seabed."""
 
@@ -274,10 +272,7 @@ class Scenario:
     @property
     def earth_rate_radps(self) -> Array:
         """Angular rate of the Earth, (3,) in W axes; zero where it does not turn."""
-        if self.latitude_deg is None:
-            return np.zeros(3)
-        latitude = self.latitude_deg * DEGREE
-        return EARTH_RATE_RADPS * np.array([0.0, math.cos(latitude), math.sin(latitude)])
+        return np.zeros(3) if self.latitude_deg is None else self.rig.w_CW_W
 
     @property
     def rig(self) -> Rig:
@@ -289,6 +284,7 @@ class Scenario:
             gps=self.gps_mounting.mounting(),
             heading=self.heading_mounting.mounting(),
             gravity=self.gravity_mps2,
+            latitude_deg=self.latitude_deg,
         )
 
     @property

@@ -13,7 +13,7 @@ from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
 from .dvl_preintegration import preintegrate_dvl
-from .imu import compile_rig
+from .imu import compile_rig, over_world
 from .interface import FACTORS, Factors
 from .so3 import exp
 
@@ -26,10 +26,12 @@ class DeadReckoning:
         attitude: "gyro" integrates the rates from the prior's attitude (its bias removed); "heading" takes the yaw
             of the heading sensor, roll and pitch being level (or all three, from a sensor that gives them).
         factors: "heading" and "depth" may be left out; without "dvl" it stands still.
+        earth_rotation: by "gyro", take the Earth's rate off what the gyro senses; needs the rig's latitude.
     """
 
     attitude: Literal["gyro", "heading"] = "heading"
     factors: Factors = FACTORS
+    earth_rotation: bool = False
 
     def begin(self, prior: Belief, rig: Rig) -> DeadReckoningPass:
         """See `Estimator.begin`."""
@@ -43,7 +45,7 @@ class DeadReckoningPass:
         self.counts: Counter[str] = Counter()
         self._config = config
         self._rig = rig
-        self._records = compile_rig(rig, config.factors, {})
+        self._records = compile_rig(rig, config.factors, {}, config.earth_rotation)
         self._t_ns = prior.t_ns
         self._prior = prior.state
         self._R_WB, self._p_WB_W = prior.state.R_WB, prior.state.p_WB_W
@@ -55,7 +57,7 @@ class DeadReckoningPass:
         if len(epoch.imu):
             held_ns = np.array([self._t_ns])
             rate_bias = self._prior.b_g
-            imu = epoch.imu
+            imu = over_world(epoch.imu, self._R_WB, rate_bias, self._records)
             if self._config.attitude == "heading":  # nothing turns between two headings
                 imu = imu.copy()
                 imu["w_WI_I"] = rate_bias

@@ -38,6 +38,7 @@ class FilterOptions:
             counted. A filter that has gone wrong leaves out good readings too, and may never find back.
         max_delay_s: how far back it can go for a late reading.
         merge_ns: a reading at most this much older than its epoch is taken as of its epoch, and counted.
+        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
 
     factors: Factors = FACTORS
@@ -45,6 +46,7 @@ class FilterOptions:
     gate: Gate = Field(default_factory=dict)
     max_delay_s: float = Field(default=5.0, ge=0, allow_inf_nan=False)
     merge_ns: int = Field(default=1_000_000, ge=0)
+    earth_rotation: bool = False
 
 
 class Kalman(ABC):
@@ -102,7 +104,7 @@ class FilterPass:
         self._config = config
         self._kalman = kalman
         self._lived = lived
-        self._rig = compile_rig(rig, config.factors, config.inflate)
+        self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._widths = gate_widths(config.gate) if config.gate else None
         self._t_ns = prior.t_ns
         self._state = as_record(prior)

@@ -31,12 +31,13 @@ from .gtsam_border import (
     displacement_factor,
     gtsam_failures,
     insert_state,
+    motion_factor,
     preintegrate_imu,
     prior_factor,
     reading_factor,
     tight_displacement_factor,
 )
-from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise, sandwich
+from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, over_world, predict, process_noise, sandwich
 from .innovation import normalised_square
 from .interface import FACTORS, Diverged, Factors, Inflation
 from .measurements import measure
@@ -95,6 +96,8 @@ class GraphSmoother(ABC):
             a vehicle that is lost by more than the width never hears that sensor again.
         factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
         hindsight_covariance_s: period at which states with hindsight keep their covariance.
+        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude. The IMU factor is then ours
+            (`gtsam_border.motion_factor`), for GTSAM's own takes the Earth's turning to first order only.
     """
 
     dvl: Annotated[frozenset[DvlFactor], Field(min_length=1), AfterValidator(_once)] = frozenset({"velocity"})
@@ -108,6 +111,7 @@ class GraphSmoother(ABC):
     robust: Losses = Field(default_factory=dict)
     factorization: Literal["QR", "CHOLESKY"] = "QR"
     hindsight_covariance_s: Positive = 5.0
+    earth_rotation: bool = False
 
     @property
     @abstractmethod
@@ -162,7 +166,7 @@ class GraphPass:
     def __init__(self, config: GraphSmoother, prior: Belief, rig: Rig) -> None:
         self.counts: Counter[str] = Counter()
         self._config = config
-        self._rig = compile_rig(rig, config.factors, config.inflate)
+        self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._R_BI = rig.imu.R_BS
         self._silence_ns = int((config.period_s + LONGEST_SILENCE_S) * 1e9)
         self._losses: list[Loss | None] = [config.robust.get(sensor) for sensor in SENSOR]
@@ -276,8 +280,11 @@ class GraphPass:
 
         record, block = self._block(last, self._state, t_ns)
         state, _, _ = self._predict(record, block, t_ns)
-        preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig)
-        self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
+        if self._config.earth_rotation:
+            self._graph.add(motion_factor(i, j, block, record, self._rig))
+        else:
+            preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig)
+            self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
         pending, self._pending = self._pending, []
         for reading in pending:
             at_ns = _time_of(reading)
@@ -369,8 +376,9 @@ class GraphPass:
             return
         straight = self._config.dvl_between == "straight"
         inflate = self._rig["inflate"][0, DVL]
+        imu = over_world(last.imu, self._state.R_WB, self._state.b_g, self._rig)
         displacement = preintegrate_dvl(
-            last.imu, last.t_ns, readings["t_ns"].copy(), readings["z"][:, :3].copy(), inflate * readings["sigma"],
+            imu, last.t_ns, readings["t_ns"].copy(), readings["z"][:, :3].copy(), inflate * readings["sigma"],
             self._state.b_g, self._rig, straight,
         )  # fmt: skip
         self.counts["preintegrated"] += len(readings)

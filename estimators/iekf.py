@@ -9,6 +9,14 @@ carries xi by a matrix that knows nothing of the state, exactly (Exp(xi_j) = Γ 
 in Γ), and a DVL's velocity measures R_BW nu, whatever phi is: a wrong heading makes neither of them wrong. Only the
 biases' columns of the transition and the other sensors' rows still depend on the state.
 
+Where W turns (`earth_rotation`, see `imu`), phi turns with it, phi_j = E phi, and so do rho and nu; but v is over W,
+not over the stars, and p is counted in W. With u' = p_j − p_i and positions from the origin,
+
+    rho_j = rho + T E nu + (E [g₂]× + [p_i]× (E − I)) phi
+    nu_j = (E − T Ω× E) nu + (E [g₁]× − Ω× E [g₂]× + [u']× Ω× E) phi
+
+The two terms in the state are a turn of the Earth in T of it: a wrong heading enters through them 1e-4 as much.
+
 Positions are counted from the prior's, for rho turns about the point that they are counted from: an unknown heading
 is then an unknown turn about where the vehicle began.
 
@@ -99,17 +107,20 @@ def propagate_invariant(
     """x ← f(x, imu), P ← Φ P Φᵀ + A Q Aᵀ, with A = `to_invariant` at the end."""
     s = state[0]
     F, Q, R_i = np.empty((DIM, DIM)), np.empty((DIM, DIM)), s.R_WB.copy()
+    back = from_invariant(R_i, s.p_WB_W - origin, s.v_WB_W)
     integrate(imu, before, s.b_a, s.b_g, rig, block)
     predict(block, state, rig[0].gravity, F, state)
     process_noise(block, R_i, Q)
     A = to_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
-    Phi = invariant_transition(block, rig[0].gravity, F, A)
+    Phi = A @ F @ back if block[0].w_CW_W.any() else invariant_transition(block, rig[0].gravity, F, A)
     s.P[:] = sandwich(Phi, s.P) + sandwich(A, Q)
 
 
 @njit(cache=True)
 def invariant_transition(block: NDArray[Any], gravity: float, F: Array, A: Array) -> Array:
     """Φ (15, 15) of a block: constant for the group, [g]× and T; only the biases' columns come from F and the state.
+
+    In a W that does not turn.
 
     Args:
         block: BLOCK record of length 1.

@@ -19,6 +19,16 @@ block's start, i:
 
     R_j = R_i ΔR        v_j = v_i + g T + R_i Δv        p_j = p_i + v_i T + ½ g T² + R_i Δp
 
+An IMU senses its motion over the celestial frame C, the stars; W turns under it with the Earth, at Ω = w_CW_W (where
+`earth_rotation` says so; else Ω = 0). Over C, in the axes that W has at i and about the place that B has at i, all of
+this holds as it stands, lever arm included, but that gravity turns with W. Back over W, with E = Exp(−Ω T),
+
+    R_j = E R_i ΔR        p_j = p_i + E u        v_j = E (v_i + g₁ + R_i Δv) − Ω × E u        u = v_i T + g₂ + R_i Δp
+    g₁ = ∫ Exp(Ω t) g dt = g T + ½ Ω×g T² + ⅙ Ω×Ω×g T³ + …    g₂ = ∫ (T − t) Exp(Ω t) g dt = ½ g T² + ⅙ Ω×g T³ + …
+
+in which are Coriolis' −2 Ω × v, and how the sum of f turns over W. Left out are the centrifugal force of u (that of
+p_i is part of gravity) and what is in Ω² of g₂: Ω² v T / 2, or 5e-9 m/s² at 2 m/s and T = 1 s.
+
 Coning, sculling: Savage 1998, doi:10.2514/2.4228 and 2.4242, the forms for one sample and the one before it.
 """
 
@@ -33,7 +43,7 @@ from numpy.typing import NDArray
 from ..datasets.epochs import IMU_SAMPLE
 from ..datasets.rig import Rig
 from ..datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array
-from .so3 import cross, exp, exp_into, product, product_into, right_jacobian, skew, transform
+from .so3 import cross, exp, exp_into, inverse_transform, product, product_into, right_jacobian, skew, transform
 
 HELD_RATE = 0.1
 """rad/s: how far the rate may stray, for the whole of a gap, from the sample that is held over it."""
@@ -52,6 +62,7 @@ RIG = np.dtype(
         ("gyro_walk", "f8"),
         ("accel_walk", "f8"),
         ("gravity", "f8"),
+        ("w_CW_W", "f8", (3,)),  # the Earth's rate, rad/s; zero where its turning is left out
         ("rate_cov", "f8", (3, 3)),  # covariance of ω × l from the noise of one gyro sample, m²/s²
         ("inflate", "f8", (5,)),  # factor on sigma by kind of reading; inf: not used
     ]
@@ -83,12 +94,19 @@ BLOCK = np.dtype(
         ("p_bg", "f8", (3, 3)),
         ("N", "f8", (9, 9)),  # covariance of (φ, Δp, Δv) in B_i axes, with true ΔR = Exp(φ) ΔR
         ("bias_walk", "f8", (2,)),  # variance that b_a and b_g gain over the block
+        ("w_CW_W", "f8", (3,)),  # rate at which W turned meanwhile, rad/s
     ]
 )
 
 
-def compile_rig(rig: Rig, factors: frozenset[str], inflate: dict[str, float]) -> NDArray[Any]:
-    """Return the rig as one RIG record; sensors that are not in `factors` get an infinite sigma."""
+def compile_rig(
+    rig: Rig, factors: frozenset[str], inflate: dict[str, float], earth_rotation: bool = False
+) -> NDArray[Any]:
+    """Return the rig as one RIG record; sensors that are not in `factors` get an infinite sigma.
+
+    Raises:
+        DatasetError: earth_rotation, of a rig whose latitude is not known.
+    """
     record = np.zeros(1, RIG)
     noise = rig.imu_noise
     record["R_BI"], record["p_BI_B"], record["p_BP_B"] = rig.imu.R_BS, rig.imu.p_BS_B, rig.depth.p_BS_B
@@ -96,6 +114,8 @@ def compile_rig(rig: Rig, factors: frozenset[str], inflate: dict[str, float]) ->
     record["gyro_density"] = noise.gyro_density * inflate.get("gyro", 1.0)
     record["accel_density"] = noise.accel_density * inflate.get("accel", 1.0)
     record["gyro_walk"], record["accel_walk"], record["gravity"] = noise.gyro_walk, noise.accel_walk, rig.gravity
+    if earth_rotation:
+        record["w_CW_W"] = rig.w_CW_W
     for kind, sensor in enumerate(("dvl", "depth", "gps", "heading", "heading")):
         record["inflate"][0, kind] = inflate.get(sensor, 1.0) if sensor in factors else np.inf
     return record
@@ -149,7 +169,7 @@ def integrate(
 
     c_i, c_j = cross(rates[0], arm), cross(rates[n], arm)
     v_end, p_end = v - transform(R, c_j), p - transform(R, arm)
-    block.T, block.dR[:], block.b_a[:], block.b_g[:] = T, R, b_a, b_g
+    block.T, block.dR[:], block.b_a[:], block.b_g[:], block.w_CW_W[:] = T, R, b_a, b_g, g.w_CW_W
     block.dv[:] = v_end + c_i
     block.dp[:] = p_end + T * c_i + arm
     _spread(imu, R_mid, v_mid, p_mid, v_end, p_end, rig, out)
@@ -290,13 +310,59 @@ def predict(block: NDArray[Any], state: NDArray[Any], gravity: float, F: Array, 
     v_j = s.v_WB_W + transform(R_i, dv)
     p_j[2] -= 0.5 * gravity * T * T
     v_j[2] -= gravity * T
-    e.R_WB[:] = product(R_i, dR)
+    R_j = product(R_i, dR)
+    if b.w_CW_W.any():
+        turn_world(b.w_CW_W, T, gravity, s.p_WB_W, R_j, p_j, v_j, F)
+    e.R_WB[:] = R_j
     e.p_WB_W[:], e.v_WB_W[:], e.b_a[:], e.b_g[:] = p_j, v_j, s.b_a, s.b_g
 
 
 @njit(cache=True)
+def turn_world(
+    w_CW_W: Array, T: float, gravity: float, p_i: Array, R_j: Array, p_j: Array, v_j: Array, F: Array
+) -> None:
+    """Turn W, for T seconds, under a motion over C that began at p_i; changes R_j, p_j, v_j and F (15, 15) in place.
+
+    The error theta is on the right of R, where E does not touch it; of p and v, E u and all else is linear.
+    """
+    E = exp(-T * w_CW_W)
+    w_x_g = cross(w_CW_W, np.array([0.0, 0.0, -gravity]))
+    u = transform(E, p_j - p_i + T**3 / 6.0 * w_x_g)
+    v = transform(E, v_j + 0.5 * T**2 * w_x_g + T**3 / 6.0 * cross(w_CW_W, w_x_g))
+    R_j[:], p_j[:], v_j[:] = product(E, R_j), p_i + u, v - cross(w_CW_W, u)
+    for j in range(15):
+        if j < 3 or j >= 6:  # by p_i, p_j changes as it did, and v_j not at all
+            of_u = transform(E, F[POSITION, j])
+            F[VELOCITY, j] = transform(E, F[VELOCITY, j]) - cross(w_CW_W, of_u)
+            F[POSITION, j] = of_u
+
+
+@njit(cache=True)
+def over_world(imu: NDArray[Any], R_i: Array, b_g: Array, rig: NDArray[Any]) -> NDArray[Any]:
+    """Return IMU_SAMPLE rows with the rates over W alone, less R_IW w_CW_W of the Earth that the gyro senses as well.
+
+    Args:
+        imu: rows of a block.
+        R_i: R_WB at its start.
+        b_g: (3,) gyro bias, rad/s; it stays in the rates.
+        rig: RIG record of length 1.
+    """
+    g, R = rig[0], R_i.copy()
+    if not g.w_CW_W.any():
+        return imu
+    rows = imu.copy()
+    for k in range(len(rows)):
+        rows[k].w_WI_I[:] -= inverse_transform(g.R_BI, inverse_transform(R, g.w_CW_W))
+        R = product(R, exp(rows[k].dt_s * transform(g.R_BI, rows[k].w_WI_I - b_g)))
+    return rows
+
+
+@njit(cache=True)
 def process_noise(block: NDArray[Any], R_i: Array, Q: Array) -> None:
-    """Fill Q (15, 15): what the block's noise adds to the error covariance at its end; R_i is R_WB at its start."""
+    """Fill Q (15, 15): what the block's noise adds to the error covariance at its end; R_i is R_WB at its start.
+
+    How W turns meanwhile is left out: it is 1e-4 of Q.
+    """
     b = block[0]
     Q[:] = 0.0
     G = (b.dR.T.copy(), R_i.copy(), R_i.copy())
