@@ -31,7 +31,6 @@ from .gtsam_border import (
     displacement_factor,
     gtsam_failures,
     insert_state,
-    motion_factor,
     preintegrate_imu,
     prior_factor,
     reading_factor,
@@ -96,8 +95,7 @@ class GraphSmoother(ABC):
             a vehicle that is lost by more than the width never hears that sensor again.
         factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
         hindsight_covariance_s: period at which states with hindsight keep their covariance.
-        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude. The IMU factor is then ours
-            (`gtsam_border.motion_factor`), for GTSAM's own takes the Earth's turning to first order only.
+        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
 
     dvl: Annotated[frozenset[DvlFactor], Field(min_length=1), AfterValidator(_once)] = frozenset({"velocity"})
@@ -280,11 +278,8 @@ class GraphPass:
 
         record, block = self._block(last, self._state, t_ns)
         state, _, _ = self._predict(record, block, t_ns)
-        if self._config.earth_rotation:
-            self._graph.add(motion_factor(i, j, block, record, self._rig))
-        else:
-            preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig)
-            self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
+        preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig, record[0]["p_WB_W"])
+        self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
         pending, self._pending = self._pending, []
         for reading in pending:
             at_ns = _time_of(reading)

@@ -86,11 +86,13 @@ def equivalent_samples(
 
 
 def preintegrate_imu(
-    imu: NDArray[Any], before: NDArray[Any], block: NDArray[Any], rig: NDArray[Any]
+    imu: NDArray[Any], before: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], p_WB_W: Array = ZERO
 ) -> gtsam.PreintegratedCombinedMeasurements:
     """Return GTSAM's preintegration of a block of at least one sample, around the biases of `block`.
 
-    What gaps add to the noise is spread over the block as white noise of the same total.
+    What gaps add to the noise is spread over the block as white noise of the same total. Told how W turns, GTSAM 4.3
+    predicts what `imu.predict` does, but takes W to turn about its origin: the centrifugal force that this adds at
+    p_WB_W, where the block begins, is part of gravity already, and is taken off it here.
     """
     g, b = rig[0], block[0]
     held_s = float(imu["held_s"] @ imu["dt_s"]) / float(b["T"])
@@ -99,79 +101,18 @@ def preintegrate_imu(
     params.setGyroscopeCovariance((gyro_var + HELD_RATE**2 * held_s) * np.eye(3))
     params.setAccelerometerCovariance((accel_var + HELD_ACCEL**2 * held_s) * np.eye(3))
     params.setIntegrationCovariance(INTEGRATION_DENSITY**2 * np.eye(3))
-    params.setBiasAccCovariance(_walk(g, "accel") ** 2 * np.eye(3))
-    params.setBiasOmegaCovariance(_walk(g, "gyro") ** 2 * np.eye(3))
+    accel_walk, gyro_walk = (max(g[f"{s}_walk"], LEAST_WALK * g[f"{s}_density"]) for s in ("accel", "gyro"))
+    params.setBiasAccCovariance(accel_walk**2 * np.eye(3))
+    params.setBiasOmegaCovariance(gyro_walk**2 * np.eye(3))
+    if b["w_CW_W"].any():
+        params.setOmegaCoriolis(b["w_CW_W"])
+        params.n_gravity = params.n_gravity + np.cross(b["w_CW_W"], np.cross(b["w_CW_W"], p_WB_W))
     bias = gtsam.imuBias.ConstantBias(g["R_BI"] @ b["b_a"], g["R_BI"] @ b["b_g"])
     preintegrated = gtsam.PreintegratedCombinedMeasurements(params, bias)
     accel, gyro, dts = equivalent_samples(imu, before, rig, block)
     for f, w, dt in zip(accel, gyro, dts.tolist(), strict=True):
         preintegrated.integrateMeasurement(f, w, dt)
     return preintegrated
-
-
-def _walk(g: Any, sensor: str) -> float:
-    """Return the density of a bias's walk that GTSAM is told."""
-    return max(g[f"{sensor}_walk"], LEAST_WALK * g[f"{sensor}_density"])
-
-
-@njit(cache=True)
-def _motion_error(
-    block: NDArray[Any], at_i: NDArray[Any], at_j: NDArray[Any], gravity: float, r: Array, F: Array, H_j: Array
-) -> None:
-    """Fill r (15,) = x_j ⊖ f(x_i), and its derivatives by the errors of i (to F) and of j."""
-    end = at_i.copy()
-    predict(block, at_i, gravity, F, end)
-    _prior_error(end, at_j, r, H_j)
-    # Log(R_fᵀ R_j) by the error at the end, which is on the left of it: −J_l⁻¹
-    F[:] = -F
-    F[THETA, :] = inverse_right_jacobian(-r[THETA]) @ np.ascontiguousarray(F[THETA, :])
-
-
-@njit(cache=True)
-def _linearise_motion(
-    block: NDArray[Any], pose_i: Array, v_i: Array, pose_j: Array, v_j: Array, bias_i: Array, bias_j: Array,
-    rig: NDArray[Any],
-) -> tuple[Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
-    R_BI = rig[0].R_BI
-    r, H_i, H_j = np.empty(15), np.empty((15, 15)), np.empty((15, 15))
-    at_i, at_j = _as_state(pose_i, v_i, bias_i, R_BI), _as_state(pose_j, v_j, bias_j, R_BI)
-    _motion_error(block, at_i, at_j, rig[0].gravity, r, H_i, H_j)
-    H_xi, H_vi, H_bi = _by_gtsam(H_i, pose_i[0:3, 0:3], R_BI)
-    H_xj, H_vj, H_bj = _by_gtsam(H_j, pose_j[0:3, 0:3], R_BI)
-    return r, H_xi, H_vi, H_xj, H_vj, H_bi, H_bj
-
-
-def motion_factor(i: int, j: int, block: NDArray[Any], at_i: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
-    """Return the factor of a block between two keyframes by `imu.predict`: CombinedImuFactor's, in a W that turns.
-
-    GTSAM's own, told of the Earth's rate (`setOmegaCoriolis`), adds the Earth's turn to the rotation vector of the
-    block's, and has −2 Ω × v of Coriolis, but not how the specific force turns while it is summed, Ω × ½ g T²: 3.6e-4
-    m/s in a second.
-
-    Args:
-        i, j: keyframes.
-        block: BLOCK record from i to j, of at least one sample.
-        at_i: STATE record at keyframe i, where the covariance is evaluated.
-        rig: RIG record.
-    """
-    Q, T, g = np.empty((15, 15)), float(block[0]["T"]), rig[0]
-    process_noise(block, at_i[0]["R_WB"], Q)
-    Q[POSITION, POSITION] += INTEGRATION_DENSITY**2 * T * np.eye(3)
-    for part, sensor in ((ACCEL_BIAS, "accel"), (GYRO_BIAS, "gyro")):
-        Q[part, part] = _walk(g, sensor) ** 2 * T * np.eye(3)
-
-    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
-        bias_i, bias_j = values.atConstantBias(B(i)).vector(), values.atConstantBias(B(j)).vector()
-        v_i, v_j = values.atVector(V(i)), values.atVector(V(j))
-        r, *H = _linearise_motion(block, pose_i, v_i, pose_j, v_j, bias_i, bias_j, rig)
-        if jacobians is not None:
-            for k in range(6):
-                jacobians[k] = H[k]
-        return r
-
-    model = gtsam.noiseModel.Gaussian.Covariance(Q)
-    return gtsam.CustomFactor(model, [X(i), V(i), X(j), V(j), B(i), B(j)], error)
 
 
 @njit(cache=True)

@@ -24,10 +24,10 @@ An IMU senses its motion over the celestial frame C, the stars; W turns under it
 this holds as it stands, lever arm included, but that gravity turns with W. Back over W, with E = Exp(−Ω T),
 
     R_j = E R_i ΔR        p_j = p_i + E u        v_j = E (v_i + g₁ + R_i Δv) − Ω × E u        u = v_i T + g₂ + R_i Δp
-    g₁ = ∫ Exp(Ω t) g dt = g T + ½ Ω×g T² + ⅙ Ω×Ω×g T³ + …    g₂ = ∫ (T − t) Exp(Ω t) g dt = ½ g T² + ⅙ Ω×g T³ + …
+    g₁ = ∫ Exp(Ω t) g dt = g T + T²/2 Ω×g + T³/6 Ω×Ω×g        g₂ = ∫ g₁ dt = T²/2 g + T³/6 Ω×g + T⁴/24 Ω×Ω×g
 
-in which are Coriolis' −2 Ω × v, and how the sum of f turns over W. Left out are the centrifugal force of u (that of
-p_i is part of gravity) and what is in Ω² of g₂: Ω² v T / 2, or 5e-9 m/s² at 2 m/s and T = 1 s.
+(to the order of Ω²), in which are Coriolis' −2 Ω × v and how the sum of f turns over W. Left out is the centrifugal
+force of u, that of p_i being part of gravity: Ω² v T / 2, or 5e-9 m/s² at 2 m/s and T = 1 s.
 
 Coning, sculling: Savage 1998, doi:10.2514/2.4228 and 2.4242, the forms for one sample and the one before it.
 """
@@ -327,8 +327,9 @@ def turn_world(
     """
     E = exp(-T * w_CW_W)
     w_x_g = cross(w_CW_W, np.array([0.0, 0.0, -gravity]))
-    u = transform(E, p_j - p_i + T**3 / 6.0 * w_x_g)
-    v = transform(E, v_j + 0.5 * T**2 * w_x_g + T**3 / 6.0 * cross(w_CW_W, w_x_g))
+    w_x_w_x_g = cross(w_CW_W, w_x_g)
+    u = transform(E, p_j - p_i + T**3 / 6.0 * w_x_g + T**4 / 24.0 * w_x_w_x_g)
+    v = transform(E, v_j + T**2 / 2.0 * w_x_g + T**3 / 6.0 * w_x_w_x_g)
     R_j[:], p_j[:], v_j[:] = product(E, R_j), p_i + u, v - cross(w_CW_W, u)
     for j in range(15):
         if j < 3 or j >= 6:  # by p_i, p_j changes as it did, and v_j not at all
