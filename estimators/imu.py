@@ -27,7 +27,7 @@ this holds as it stands, lever arm included, but that gravity turns with W. Back
     g₁ = ∫ Exp(Ω t) g dt = g T + T²/2 Ω×g + T³/6 Ω×Ω×g        g₂ = ∫ g₁ dt = T²/2 g + T³/6 Ω×g + T⁴/24 Ω×Ω×g
 
 (to the order of Ω²), in which are Coriolis' −2 Ω × v and how the sum of f turns over W. Left out is the centrifugal
-force of u, that of p_i being part of gravity: Ω² v T / 2, or 5e-9 m/s² at 2 m/s and T = 1 s.
+force of u and of the lever arm, that of p_i being part of gravity: Ω² (v T / 2 + |l|), 5e-9 m/s² at a metre.
 
 Coning, sculling: Savage 1998, doi:10.2514/2.4228 and 2.4242, the forms for one sample and the one before it.
 """
@@ -353,8 +353,10 @@ def over_world(imu: NDArray[Any], R_i: Array, b_g: Array, rig: NDArray[Any]) -> 
         return imu
     rows = imu.copy()
     for k in range(len(rows)):
-        rows[k].w_WI_I[:] -= inverse_transform(g.R_BI, inverse_transform(R, g.w_CW_W))
-        R = product(R, exp(rows[k].dt_s * transform(g.R_BI, rows[k].w_WI_I - b_g)))
+        w_CB_B, dt = transform(g.R_BI, rows[k].w_WI_I - b_g), rows[k].dt_s
+        w_CW_B = inverse_transform(product(R, exp(0.5 * dt * w_CB_B)), g.w_CW_W)
+        rows[k].w_WI_I[:] -= inverse_transform(g.R_BI, w_CW_B)
+        R = product(R, exp(dt * (w_CB_B - w_CW_B)))
     return rows
 
 
