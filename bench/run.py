@@ -71,7 +71,9 @@ class Result:
         counts: what happened to readings, gaps and solvers, by name.
         duration_s: how much of the log was driven through.
         imu_samples: how many IMU samples went in.
-        notes: how the start was found, where the log states no prior.
+        start: where the prior came from: "given" by the log's maker, else what `initialise` found: "static", "moving",
+            and after a comma what is unusual in that.
+        notes: how the start was found, in sentences.
         nis: INNOVATION rows, in the order of reception; None where they were not asked for.
     """
 
@@ -86,6 +88,7 @@ class Result:
     counts: dict[str, int]
     duration_s: float
     imu_samples: int
+    start: str = "given"
     notes: tuple[str, ...] = ()
     nis: NDArray[Any] | None = None
 
@@ -223,7 +226,7 @@ def run_log(
     Raises:
         DatasetError: no prior can be made for the log.
     """
-    log, notes = _with_prior(log)
+    log, start, notes = _with_prior(log)
     assert log.prior is not None
     readings = sum(len(stream) for sensor, stream in log.streams.items() if sensor in estimator.factors)
     limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
@@ -256,19 +259,20 @@ def run_log(
         {"readings": readings} | voyage.counts | (examiner.counts if examiner else {}) | counts,
         (driven[-1].t_ns - voyage.start_ns) * 1e-9 if driven else 0.0,
         sum(len(epoch.imu) for epoch in driven),
+        start,
         notes,
         examiner.table() if examiner else None,
     )
 
 
-def _with_prior(log: Log) -> tuple[Log, tuple[str, ...]]:
-    """Return the log with a prior, and what was assumed to make it."""
+def _with_prior(log: Log) -> tuple[Log, str, tuple[str, ...]]:
+    """Return the log with a prior, where that came from, and in sentences how it was made."""
     if log.prior is not None:
-        return log, ()
+        return log, "given", ()
     from ..datasets.initialise import initialise
 
-    start = initialise(log)
-    return log.with_prior(start.belief), start.notes
+    found = initialise(log)
+    return log.with_prior(found.belief), found.start, found.notes
 
 
 def _drive(run: Pass, voyage: Voyage, tape: Tape, limit_ns: float, examiner: Examiner | None) -> Ending:

@@ -454,6 +454,7 @@ class Bench:
             "failed_at_s": result.failed_at_s,
             "truth_kind": log.truth_kind if log.truth is not None else None,
             "duration_s": result.duration_s,
+            "start": result.start,
             "counts": json.dumps(plain(result.counts)),
             "notes": json.dumps([*log.notes, *result.notes]),
             **costs(result),

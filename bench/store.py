@@ -34,6 +34,7 @@ OUTCOME = {
     "align": "TEXT",
     "dims": "TEXT",
     "duration_s": "REAL",
+    "start": "TEXT",  # where the prior came from: "given", "static", "moving", ...
 }
 HONESTY = {
     "nees_at": "TEXT",  # JSON: NEES by block at times fixed beforehand, see `consistency.nees_at`

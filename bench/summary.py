@@ -75,7 +75,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
     Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES, coverage are means; of
     costs, the median is taken. `runs` and `done` say over how many; where none is done, the numbers are None. `anees_*`
     is the mean over the fixed times of `consistency`, by degree of freedom, with the number of those times at which it
-    lies above and below its interval.
+    lies above and below its interval. `start` says where the priors came from, each way once.
     """
     every = records(rows)
     runs = {key: len(groups(of, "seed")) for key, of in groups(every, "log", "label").items()}
@@ -85,6 +85,8 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         done = [row for row in group if row["status"] == "done"]
         record: Record = {"log": log, "label": label, "output": output}
         record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
+        starts = dict.fromkeys(row["start"] for row in group if row.get("start") is not None)
+        record |= {"start": " | ".join(starts) or None}
         record |= _rpe_step(group)
         record |= {"runs": runs[log, label], "done": len(done)}
         record |= {count: sum(row[count] or 0 for row in done) for count in ("n_scored", "n_rpe")}
