@@ -22,6 +22,8 @@ from .so3 import exp
 class DeadReckoning:
     """No fusion: the DVL's velocity, held between readings, rotated by the attitude and summed.
 
+    An axis that a reading does not measure has no velocity: a wheel says how fast, and the nose says where to.
+
     Attributes:
         attitude: "gyro" integrates the rates from the prior's attitude (its bias removed); "heading" takes the yaw
             of the heading sensor, roll and pitch being level (or all three, from a sensor that gives them).
@@ -91,7 +93,7 @@ class DeadReckoningPass:
         self._newest_ns[kind] = int(reading["t_ns"])
         if kind == DVL:
             measured = np.isfinite(reading["sigma"])
-            self._v_WB_B = np.where(measured, z[:3], self._v_WB_B)
+            self._v_WB_B = np.where(measured, z[:3], 0.0)
         elif kind == DEPTH:
             lever_m = (self._R_WB @ self._rig.depth.p_BS_B)[2]
             self._p_WB_W = np.array([self._p_WB_W[0], self._p_WB_W[1], z[0] - lever_m])
