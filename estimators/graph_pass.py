@@ -76,7 +76,10 @@ class GraphSmoother(ABC):
             at most: over a second they differ little; over 5 s with a consumer's gyro, loose claims to know the
             attitude too well. With "velocity" beside it, the reading at a keyframe goes by its velocity and the others
             are summed, so that none is used twice. A reading that comes after its interval was closed goes by its
-            velocity whatever is said here.
+            velocity whatever is said here. So does an interval with a reading that leaves an axis unmeasured (wheel
+            speed): as the vehicle turns, what is not known of one axis of B gets into every axis of the sum, and no
+            displacement is known. `not_summed` counts the readings of such intervals, and of those that max_hold_s
+            leaves out.
         dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
             straight, up to the reading at the interval's end (which so has a small part in two factors). Held, its
             covariance knows the DVL's and the gyro's noise but not what is lost by holding: on a vehicle that
@@ -366,7 +369,9 @@ class GraphPass:
         readings = readings[np.argsort(readings["t_ns"], kind="stable")]
         times = np.concatenate([[last.t_ns], readings["t_ns"], [new.t_ns]])
         if np.diff(times).max() > self._config.max_hold_s * 1e9 or not np.isfinite(readings["sigma"]).all():
-            for k in np.flatnonzero(readings["t_ns"] < new.t_ns - self._config.merge_ns).tolist():
+            one_by_one = np.flatnonzero(readings["t_ns"] < new.t_ns - self._config.merge_ns).tolist()
+            self.counts["not_summed"] += len(one_by_one)
+            for k in one_by_one:
                 self._add_reading(last, readings[k : k + 1])
             return
         straight = self._config.dvl_between == "straight"
