@@ -37,7 +37,8 @@ HEADING_FLOOR_RAD = np.radians(1.0)
 UNKNOWN_HEADING_RAD = np.pi / np.sqrt(3)
 SLIP_RAD = 0.05
 """A vehicle whose sideways velocity is not measured goes this far off its nose."""
-UNKNOWN_SPEED_M_S = 1.5
+UNKNOWN_SPEED_M_S, FASTEST_M_S = 1.5, 30.0
+"""Sigma of a velocity of which nothing is known; and of one that the fixes tell, of a ship or a car as well."""
 ORIGIN_SIGMA_M = 0.5
 """How well the vehicle's place at the start of the log is W's origin."""
 UNKNOWN_DEPTH_M = 5.0
@@ -171,7 +172,8 @@ class InitialState:
             self._know_heading(rows, x)
             self._know_place(rows, x)
             self._know_height(rows, x)
-            rows.add(EACH[WAY], np.zeros(3), UNKNOWN_SPEED_M_S)
+            ahead = FASTEST_M_S if len(self._fixes) > 1 else UNKNOWN_SPEED_M_S
+            rows.add(EACH[WAY], np.zeros(3), np.array([ahead, ahead, UNKNOWN_SPEED_M_S]))
         return rows.solve()
 
     # --- level, velocity, biases -------------------------------------------------------------------------------------
@@ -294,13 +296,13 @@ class InitialState:
         H = np.zeros((3, UNKNOWNS))
         by_gyro = -skew(lever_E) @ self._whole.turn[k]
         if self._knows_speed:
-            q = self._way[k] + lever_E
+            turned_E = q = self._way[k] + lever_E
             by_gyro = by_gyro + self._way_by_gyro[k]
         else:
-            q = self._way[k] @ R_WE.T @ x[WAY] + lever_E
+            turned_E, q = lever_E, self._way[k] @ R_WE.T @ x[WAY] + lever_E  # the way is one in W
             H[:, WAY] = R_WE @ self._way[k] @ R_WE.T
         H[:, PLACE], H[:, GYRO] = np.eye(3), R_WE @ by_gyro
-        by_turn = -R_WE @ skew(q)
+        by_turn = -R_WE @ skew(turned_E)
         H[:, GRAVITY], H[:, YAW] = by_turn @ tilt_by_gravity(x[GRAVITY]), by_turn @ up(x[GRAVITY])
         return H, x[PLACE] + R_WE @ q
 

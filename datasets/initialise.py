@@ -62,11 +62,13 @@ def initialise(log: Log, window_s: float = 2.0, max_wait_s: float = 10.0, max_al
     end_ns = _end(log, start_ns, window_s, max_wait_s)
     has_dvl, has_heading = (len(heard(stream, start_ns, end_ns)) > 0 for stream in (log.dvl, log.heading))
     if not has_dvl:
+        state = InitialState(log, start_ns, end_ns, window_s)
         for later_ns in _fixes(log, end_ns, start_ns + round(max_wait_s * 1e9)):
             state = InitialState(log, start_ns, later_ns, window_s)
             if state.belief.P[VELOCITY, VELOCITY].diagonal()[:2].max() < WAY_M_S**2:
-                return _said(state)
-    elif not has_heading:
+                break
+        return _said(state)
+    if not has_heading:
         for later_ns in _fixes(log, end_ns, start_ns + round(max_align_s * 1e9)):
             state = InitialState(log, start_ns, later_ns, window_s, heading_by_gps=True)
             if state.yaw_sigma < ALIGNED_RAD:

@@ -404,3 +404,11 @@ def test_what_is_of_second_order_in_a_velocity_is_as_many_draws_say():
     of = np.cross(theta, e) + 0.5 * np.cross(theta, np.cross(theta, v_B))
     found = second_order(v_B, B @ B.T, A @ A.T)
     np.testing.assert_allclose(found, of.T @ of / len(of), atol=0.02 * np.abs(found).max())
+
+
+def test_fixes_tell_the_velocity_in_the_world_whatever_the_heading_is():
+    log = afloat(16, dvl=None, heading=None)
+    error, P, start = error_of(log)
+    assert start == "moving, heading unknown"
+    assert (np.sqrt(np.diag(P)[VELOCITY][:2]) < 0.5).all()
+    assert (np.abs(error[VELOCITY]) < 3.5 * np.sqrt(np.diag(P)[VELOCITY])).all()
