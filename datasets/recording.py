@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict
 from .errors import DatasetError, nearest
 
 LOADERS = {
+    "ardupilot": "ardupilot:ArduPilotRecording",
     "imc": "imc:ImcRecording",
 }
 """Our formats: module and class. Other people's join by the entry-point group `fathom.loaders`."""
