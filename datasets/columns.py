@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import io
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pandas as pd
@@ -24,11 +25,19 @@ EXACT: dict[str, Any] = (
 )
 """Asks pandas for the nearest float64 of what is written; 3.1 reads so anyway (tried), and warns of the question."""
 
+BOOLEANS = {"true": 1, "True": 1, "TRUE": 1, "false": 0, "False": 0, "FALSE": 0}
+"""As pandas reads a column of nothing else; here they may stand beside numbers, or it would hang on the pieces."""
+PIECE_BYTES = 1 << 18
+PIECE_ROWS = 1 << 14
+TEXT = np.dtypes.StringDType(na_object=np.nan)
+
 Columns = dict[Column, NDArray[Any]]
 
 
 def read_table(folder: Path, table: Table, columns: Collection[Column], times: Collection[Column] = ()) -> Columns:
     """Return the named columns as float64 arrays; those in `times` as they are written (text, integers or floats).
+
+    The file is read piece by piece, and only these columns are kept.
 
     Raises:
         DatasetError: no such file or column, or a field that is not a number; names the file, the row (from 0, headers
@@ -40,8 +49,12 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
     if not path.is_file():
         names = [p.name for p in path.parent.iterdir() if p.is_file()] if path.parent.is_dir() else []
         raise DatasetError(f"{path}: no such file{nearest(path.name, names)}")
+    wanted = dict.fromkeys([*columns, *times])
     try:
-        frame = _read_parquet(path) if path.suffix == ".parquet" else _read_text(path, table, times)
+        pieces = (
+            _parquet_pieces(path, wanted) if path.suffix == ".parquet" else _text_pieces(path, table, wanted, times)
+        )
+        return _stacked(pieces, wanted, times, path)
     except DatasetError:
         raise
     except OSError as error:
@@ -49,15 +62,28 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
     except Exception as error:  # pandas and pyarrow raise many kinds for a file that is not what it seems
         raise DatasetError(f"{path}: cannot be read as a table: {str(error)[:200]}") from None
 
-    found = list(frame.columns)
-    wanted = dict.fromkeys([*columns, *times])
+
+def _stacked(
+    pieces: Iterable[pd.DataFrame], wanted: Collection[Column], times: Collection[Column], path: Path
+) -> Columns:
+    """Return the columns wanted of a table that comes in pieces, a piece at least."""
+    kept: dict[Column, list[NDArray[Any]]] = {column: [] for column in wanted}
+    row = 0
+    for piece in pieces:
+        for column, parts in kept.items():
+            series = pd.Series(piece[column])
+            parts.append(_as_written(series) if column in times else _numbers(series, path, row))
+        row += len(piece)
+    return {column: np.concatenate(kept.pop(column)) for column in wanted}
+
+
+def _check_held(wanted: Iterable[Column], found: Sequence[Column], path: Path) -> None:
     for column in wanted:
         if found.count(column) > 1:
             raise DatasetError(f"{path}: {found.count(column)} columns are called {column!r}")
         if column not in found:
             named = ", ".join(str(c) for c in found[:40])
             raise DatasetError(f"{path}: no column {column!r}{nearest(str(column), map(str, found))}; found {named}")
-    return {c: frame[c].to_numpy() if c in times else _numbers(pd.Series(frame[c]), path) for c in wanted}
 
 
 def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Column]) -> Columns:
@@ -84,60 +110,140 @@ def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Col
     return {column: np.array(found[str(column)]) for column in dict.fromkeys(wanted)}
 
 
-def _read_parquet(path: Path) -> pd.DataFrame:
-    frame = pd.read_parquet(path)
-    for column in frame.columns:
-        if pd.api.types.is_datetime64_any_dtype(frame[column]):
-            frame[column] = frame[column].astype("datetime64[ns]").astype("int64")
-    return frame
+def _parquet_pieces(path: Path, wanted: Iterable[Column]) -> Iterator[pd.DataFrame]:
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path, buffer_size=PIECE_BYTES, pre_buffer=False) as file:
+        _check_held(wanted, file.schema_arrow.names, path)
+        names = [str(column) for column in wanted]
+        if not file.metadata.num_rows:
+            yield pd.DataFrame({name: np.zeros(0) for name in names})
+        for batch in file.iter_batches(PIECE_ROWS, columns=names):
+            frame = batch.to_pandas()
+            for column in frame.columns:
+                if pd.api.types.is_datetime64_any_dtype(frame[column]):
+                    frame[column] = frame[column].astype("datetime64[ns]").astype("int64")
+            yield frame
 
 
-def _read_text(path: Path, table: Table, times: Collection[Column]) -> pd.DataFrame:
+class _Lines(io.TextIOBase):
+    """A text file without its empty lines and comments, for pandas to read."""
+
+    def __init__(self, file: IO[str], comment: str) -> None:
+        self.file, self.comment, self.ahead = file, comment, ""
+
+    def _counts(self, line: str) -> bool:
+        return bool(line.strip()) and not (self.comment and line.startswith(self.comment))
+
+    def one(self) -> str:
+        """Return the next line that counts; "" at the end."""
+        return next(filter(self._counts, self.file), "")
+
+    def read(self, size: int | None = -1) -> str:
+        """Return some whole lines that count; "" at the end."""
+        text, self.ahead = self.ahead, ""
+        while not text and (lines := self.file.readlines(PIECE_BYTES)):
+            text = "".join(filter(self._counts, lines))
+        return text
+
+
+def _text_pieces(
+    path: Path, table: Table, wanted: Iterable[Column], times: Collection[Column]
+) -> Iterator[pd.DataFrame]:
     try:
-        lines = path.read_text(encoding=table.encoding).splitlines()
-    except UnicodeDecodeError as error:
-        guess = "utf-16" if error.object[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
-        raise DatasetError(f"{path}: byte {error.start} is not {table.encoding}; set `encoding` ({guess}?)") from None
-    except LookupError:
+        with path.open(encoding=table.encoding) as file:
+            yield from _frames(_Lines(file, table.comment), path, table, wanted, times)
+    except UnicodeDecodeError:
+        raise _undecoded(path, table.encoding) from None
+    except LookupError as error:
+        if isinstance(error, KeyError | IndexError):
+            raise
         raise DatasetError(f"{path}: unknown encoding {table.encoding!r}") from None
-    lines = [line for line in lines if line.strip() and not (table.comment and line.startswith(table.comment))]
-    if not lines:
-        raise DatasetError(f"{path}: no rows")
+
+
+def _frames(
+    lines: _Lines, path: Path, table: Table, wanted: Iterable[Column], times: Collection[Column]
+) -> Iterator[pd.DataFrame]:
+    """Yield the rows of a text table, columns by name; without a header, by index."""
     separator = r"\s+" if table.delimiter == "whitespace" else table.delimiter
-    names: list[Column] = []
+    lines.ahead = lines.one()
+    if not lines.ahead:
+        raise DatasetError(f"{path}: no rows")
+    names: list[Column] | None = None
     if table.header:
-        head = pd.read_csv(io.StringIO(lines[0]), sep=separator, header=None, dtype=str, keep_default_na=False)
+        head = pd.read_csv(io.StringIO(lines.read()), sep=separator, header=None, dtype=str, keep_default_na=False)
         names = [str(name).strip() for name in head.iloc[0]]
-        lines = lines[1:]
-        if not lines:
-            return pd.DataFrame({name: np.zeros(0) for name in names})
-    frame = pd.read_csv(
-        io.StringIO("\n".join(lines)),
+        _check_held(wanted, names, path)
+        lines.ahead = lines.one()
+        if not lines.ahead:
+            yield pd.DataFrame({name: np.zeros(0) for name in names})
+            return
+    reader: Any = pd.read_csv(
+        lines,
         sep=separator,
         header=None,
-        dtype={names.index(c) if table.header else c: str for c in times if not table.header or c in names},
+        dtype={names.index(c) if names else c: str for c in times},
         skipinitialspace=True,
         index_col=False,
+        chunksize=PIECE_ROWS,
+        low_memory=False,
         **EXACT,
     )
-    if table.header:
-        if len(frame.columns) == len(names) + 1 and frame.iloc[:, -1].isna().all():
-            frame = frame.iloc[:, :-1]  # every row ends in a delimiter
-        if len(frame.columns) != len(names):
-            raise DatasetError(f"{path}: the header names {len(names)} columns, the rows have {len(frame.columns)}")
-        frame.columns = pd.Index(names)
-    return frame
+    with reader:
+        for frame in reader:
+            if names is None:
+                _check_held(wanted, list(frame.columns), path)
+            else:
+                if len(frame.columns) == len(names) + 1 and frame.iloc[:, -1].isna().all():
+                    frame = frame.iloc[:, :-1]  # every row ends in a delimiter
+                if len(frame.columns) != len(names):
+                    raise DatasetError(
+                        f"{path}: the header names {len(names)} columns, the rows have {len(frame.columns)}"
+                    )
+                frame.columns = pd.Index(names)
+            yield frame
 
 
-def _numbers(series: pd.Series, path: Path) -> NDArray[Any]:
-    """Return float64; an integer too long for it keeps its nearest float."""
+def _undecoded(path: Path, encoding: str) -> DatasetError:
+    """Return the error for a file that is not of this encoding: which byte is not."""
+    decoder = codecs.getincrementaldecoder(encoding)()
+    at, final = 0, False
+    with path.open("rb") as file:
+        start = file.read(2)
+        file.seek(0)
+        while not final:
+            chunk = file.read(PIECE_BYTES)
+            final = not chunk
+            try:
+                decoder.decode(chunk, final)
+            except UnicodeDecodeError as error:
+                at += len(chunk) - len(error.object) + error.start  # its object begins with what was left over
+                break
+            at += len(chunk)
+    guess = "utf-16" if start in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
+    return DatasetError(f"{path}: byte {at} is not {encoding}; set `encoding` ({guess}?)")
+
+
+def _as_written(series: pd.Series) -> NDArray[Any]:
+    """Return integers and floats as they are, and anything else as text; NaN where there is nothing."""
+    values = series.to_numpy()
+    if values.dtype.kind != "O":
+        return values
+    return np.array(
+        [value if absent else str(value) for value, absent in zip(values, series.isna(), strict=True)], TEXT
+    )
+
+
+def _numbers(series: pd.Series, path: Path, first_row: int) -> NDArray[Any]:
+    """Return float64; an integer too long for it keeps its nearest float, and true is 1."""
     if pd.api.types.is_numeric_dtype(series.dtype):
         return series.to_numpy(dtype=float, na_value=np.nan)
-    numbers = pd.Series(pd.to_numeric(series, errors="coerce")).to_numpy(dtype=float, na_value=np.nan)
+    plain = series.map(lambda value: BOOLEANS.get(value, value))
+    numbers = pd.Series(pd.to_numeric(plain, errors="coerce")).to_numpy(dtype=float, na_value=np.nan)
     bad = np.flatnonzero(np.isnan(numbers) & series.notna().to_numpy())
     if len(bad):
         value = str(series.iloc[bad[0]])[:40]
-        raise DatasetError(f"{path}: row {bad[0]}: column {series.name!r} holds {value!r}, not a number")
+        raise DatasetError(f"{path}: row {first_row + bad[0]}: column {series.name!r} holds {value!r}, not a number")
     return numbers
 
 
@@ -159,16 +265,12 @@ def times_ns(values: NDArray[Any], unit: str) -> tuple[TimeArray, NDArray[np.boo
         whole = np.floor(safe)
         rest = np.rint((safe - whole) * factor).astype(np.int64)
         return whole.astype(np.int64) * factor + rest, good
-    return _text_ns(values.tolist(), factor)
-
-
-def _text_ns(texts: Iterable[Any], factor: int) -> tuple[TimeArray, NDArray[np.bool_]]:
-    ns, good = [], []
-    for text in texts:
+    ns, good = np.zeros(len(values), np.int64), np.zeros(len(values), bool)
+    for row, text in enumerate(values):
         try:
             value = Decimal(text.strip()) * factor if isinstance(text, str) else NO_TIME
         except ArithmeticError:
             value = NO_TIME
-        good.append(value.is_finite() and abs(value) < LIMIT_NS)
-        ns.append(round(value) if good[-1] else 0)
-    return np.array(ns, dtype=np.int64), np.array(good, dtype=bool)
+        if value.is_finite() and abs(value) < LIMIT_NS:
+            ns[row], good[row] = round(value), True
+    return ns, good

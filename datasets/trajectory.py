@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -116,36 +118,28 @@ class Trajectory:
                 more than 1e-3 from unit length, a time that is none, or times out of order.
         """
         path = Path(path)
+        t_ns, poses = array("q"), array("d")
         try:
-            text = path.read_text(encoding="utf-8", errors="replace")
+            with path.open(encoding="utf-8", errors="replace") as file:
+                for number, line in enumerate(file, 1):
+                    fields = line.replace(",", " ").split()
+                    if not fields or fields[0].startswith("#"):
+                        continue
+                    try:
+                        stamp_ns, pose = _pose(line, fields)
+                    except ValueError as error:
+                        raise DatasetError(f"{path}: line {number}: {error}") from None
+                    t_ns.append(stamp_ns)
+                    poses.extend(pose)
         except FileNotFoundError:
             raise DatasetError(f"{path}: no such file") from None
+        except DatasetError:
+            raise
         except (OSError, ValueError) as error:  # ValueError: a null character in the name
             raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-        t_ns: list[int] = []
-        rows: list[list[float]] = []
-        for number, line in enumerate(text.splitlines(), 1):
-            fields = line.replace(",", " ").split()
-            if not fields or fields[0].startswith("#"):
-                continue
-            try:
-                rows.append([float(x) for x in fields][1:])
-            except ValueError:
-                raise DatasetError(f"{path}: line {number}: not numbers: {line[:60]!r}") from None
-            try:
-                t_ns.append(seconds_to_ns(fields[0]))
-            except ValueError as error:
-                raise DatasetError(f"{path}: line {number}: {error}") from None
-            if len(rows[-1]) != 7:
-                raise DatasetError(f"{path}: line {number}: expected t x y z qx qy qz qw, found {len(fields)} fields")
-            length = float(np.linalg.norm(rows[-1][3:]))
-            if not (np.isfinite(rows[-1]).all() and abs(length - 1) < 1e-3):
-                raise DatasetError(
-                    f"{path}: line {number}: not a finite pose with a unit quaternion (|q| = {length:.6g})"
-                )
-        if not rows:
+        if not t_ns:
             raise DatasetError(f"{path}: no poses; expected lines of t x y z qx qy qz qw")
-        values = np.array(rows)
+        values = np.array(poses).reshape(-1, 7)
         R_WB = Rotation.from_quat(values[:, 3:]).as_matrix()
         try:
             return cls(np.array(t_ns, dtype=np.int64), R_WB, values[:, :3], lookahead_s=lookahead_s)
@@ -199,6 +193,25 @@ class Trajectory:
             t_ns, table[rotation].to_numpy(float).reshape(-1, 3, 3), table[position].to_numpy(float),
             vectors("v_WB_W"), vectors("b_a"), vectors("b_g"), P, lookahead_s,
         )  # fmt: skip
+
+
+def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
+    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw.
+
+    Raises:
+        ValueError: what is wrong with it.
+    """
+    try:
+        numbers = [float(field) for field in fields]
+    except ValueError:
+        raise ValueError(f"not numbers: {line.rstrip()[:60]!r}") from None
+    stamp_ns = seconds_to_ns(fields[0])
+    if len(numbers) != 8:
+        raise ValueError(f"expected t x y z qx qy qz qw, found {len(numbers)} fields")
+    length = math.hypot(*numbers[4:])
+    if not (all(map(math.isfinite, numbers)) and abs(length - 1) < 1e-3):
+        raise ValueError(f"not a finite pose with a unit quaternion (|q| = {length:.6g})")
+    return stamp_ns, numbers[1:]
 
 
 def seconds_to_ns(text: str) -> int:
