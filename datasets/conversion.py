@@ -23,7 +23,7 @@ from . import description as d
 from .columns import EXACT, NS_PER, Columns, read_table, times_ns
 from .device_clock import common_instants
 from .errors import DatasetError
-from .geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
+from .geodesy import SEMI_MAJOR_M, ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
 from .log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
 from .recording import Wanted
 from .rig import Rig
@@ -33,6 +33,8 @@ from .trajectory import Trajectory
 Mask = NDArray[Any]
 FLIP_YZ = np.array([1.0, -1.0, -1.0])
 """FRD to FLU, and back."""
+FAR_M = 100e3
+"""No vehicle of ours is farther than this from an earth that were a ball; a receiver without a fix says (0, 0, 0)."""
 DEVICE = "device"
 """The column that a message's own clock adds."""
 
@@ -77,7 +79,7 @@ class _Opening:
             if column == DEVICE and device is not None:
                 columns[column] = device
             else:
-                which, field_name = _field(message, str(column))
+                which, field_name = _field(message, str(column), self.folder)
                 columns[column] = found[which][field_name][picks[which]]
         return columns
 
@@ -95,21 +97,21 @@ class _Opening:
                     columns |= dict.fromkeys((recording.host_clock[0], part.message.clock.field))
             for column in wanted:
                 if column != DEVICE or part.message.clock is None:
-                    which, field_name = _field(part.message, str(column))
+                    which, field_name = _field(part.message, str(column), self.folder)
                     asked[part.message.names[which], part.message.entity][field_name] = None
         read = recording.read(self.folder, [Wanted(*key, tuple(columns)) for key, columns in asked.items()])
         self.messages = dict(zip(asked, read.columns, strict=True))
         self.notes += read.notes
 
 
-def _field(message: d.Message, column: str) -> tuple[int, str]:
+def _field(message: d.Message, column: str, folder: Path) -> tuple[int, str]:
     """Return which of the joined messages a column is of, and its field there."""
     if len(message.names) == 1:
         return 0, column
     for which, name in enumerate(message.names):
         if column.startswith(f"{name}."):
             return which, column.removeprefix(f"{name}.")
-    raise DatasetError(f"column {column!r}: expected `Name.field` of one of {', '.join(message.names)}")
+    raise DatasetError(f"{folder}: column {column!r}: expected `Name.field` of one of {', '.join(message.names)}")
 
 
 def _sources(description: d.Description) -> Iterator[tuple[Any, list[d.Column]]]:
@@ -117,7 +119,7 @@ def _sources(description: d.Description) -> Iterator[tuple[Any, list[d.Column]]]
     for part in description.parts.values():
         if isinstance(part, d.ImuDescription) and part.accel_source is not None:
             yield part.accel_source, [*d.columns_of(part.accel_source), *part.accel.columns]
-            yield part, [c for c in d.columns_of(part) if c not in part.accel.columns]
+            yield part, d.columns_of(part.model_copy(update={"accel": None}))
         else:
             yield part, d.columns_of(part)
 
@@ -193,7 +195,6 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     dvl = None if streams.dvl is None else _dvl(opening, streams.dvl)
     depth = None if streams.depth is None else _depth(opening, streams.depth)
     gps_rows = None if streams.gps is None else _stream(opening, "gps", streams.gps, _position_columns(streams.gps))
-    heading = None if streams.heading is None else _heading(opening, streams.heading)
     truth_part = description.truth
     truth_rows = None
     if truth_part is not None and truth_part.time is not None and (truth_part.table or truth_part.message):
@@ -207,6 +208,7 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
             if origin is None and part is not None and part.on_the_globe and rows is not None:
                 origin = _first_fix(part, rows, int(imu.t_ns[0]))
     gps = None if gps_rows is None or streams.gps is None else _gps(streams.gps, gps_rows, origin)
+    heading = None if streams.heading is None else _heading(opening, streams.heading, origin)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
@@ -455,8 +457,18 @@ def _dvl(opening: _Opening, part: d.DvlDescription) -> DvlStream:
     v_S = _flu(v_S, part.axes)
     if part.mounting != d.MountingDescription():
         R_BS = part.mounting.mounting().R_BS
-        v_S, sigma = v_S @ R_BS.T, np.sqrt(sigma**2 @ (R_BS**2).T)  # the correlations of unequal axes are let go
+        v_S, sigma = v_S @ R_BS.T, _turned(sigma, R_BS)
     return DvlStream(rows.t_ns, rows.received_ns, v_S, sigma)
+
+
+def _turned(sigma: Array, R_BS: Array) -> Array:
+    """Return (n, 3): sigma along B's axes; the correlations of unequal axes are let go.
+
+    An infinite sigma spreads to the axes of B that the mounting gives a share in it, and to no others.
+    """
+    with np.errstate(invalid="ignore"):
+        shares = sigma[:, None, :] ** 2 * R_BS**2
+    return np.sqrt(np.where(np.abs(R_BS) < 1e-12, 0.0, shares).sum(axis=2))
 
 
 def _depth(opening: _Opening, part: d.DepthDescription) -> DepthStream:
@@ -467,11 +479,13 @@ def _depth(opening: _Opening, part: d.DepthDescription) -> DepthStream:
     return DepthStream(rows.t_ns, rows.received_ns, z_m, _sigma(rows, part, 1))
 
 
-def _heading(opening: _Opening, part: d.HeadingDescription) -> HeadingStream | AttitudeStream:
+def _heading(
+    opening: _Opening, part: d.HeadingDescription, origin: tuple[float, float] | None
+) -> HeadingStream | AttitudeStream:
     if part.attitude is not None:
         rows = _stream(opening, "heading", part, list(part.attitude.columns))
         _checked_width(rows, part, 3)
-        R = _rotations(rows, part.attitude)
+        R = _rotations(rows, part.attitude, origin)
         R = R[_in_order(rows, part.every)]
         return AttitudeStream(rows.t_ns, rows.received_ns, R.reshape(-1, 9), _sigma(rows, part, 3))
     assert part.heading is not None
@@ -501,7 +515,7 @@ def _enu_from_ecef(rows: _Rows, origin: tuple[float, float] | None) -> Array:
     return enu_axes(np.array(origin[0]), np.array(origin[1]))
 
 
-def _rotations(rows: _Rows, part: d.Attitude, origin: tuple[float, float] | None = None) -> Array:
+def _rotations(rows: _Rows, part: d.Attitude, origin: tuple[float, float] | None) -> Array:
     """Return (n, 3, 3), body FLU to W; refuse what is not a rotation."""
     values = np.stack([rows.raw[c] for c in part.columns], axis=1).astype(float, copy=False)
     if part.form == "roll_pitch_yaw":
@@ -570,7 +584,14 @@ def _latitude_longitude(rows: _Rows, part: d.Geodetic) -> tuple[Array, Array]:
 def _on_the_globe(rows: _Rows, part: Any) -> tuple[Array, Array, Array | None]:
     """Return latitude, longitude (rad) and height (m, where there is one) of rows that tell a place on the globe."""
     if part.geodetic is None:
-        return geodetic_from_ecef(rows.si(part.position))
+        p_ecef = rows.si(part.position)
+        far = ~(np.abs(np.linalg.norm(p_ecef, axis=1) - SEMI_MAJOR_M) < FAR_M)
+        rows.refuse(
+            far,
+            lambda row: f"no place on earth: ({', '.join(f'{x:g}' for x in p_ecef[row])}) m, ECEF",
+            "at no place on earth",
+        )
+        return geodetic_from_ecef(p_ecef[~far])
     lat, lon = _latitude_longitude(rows, part.geodetic)  # may drop rows, so it comes first
     return lat, lon, None if part.geodetic.altitude is None else rows.si(part.geodetic.altitude)[:, 0]
 

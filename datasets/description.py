@@ -560,7 +560,8 @@ class Description(Part):
 
     @model_validator(mode="after")
     def _messages_have_a_recording(self) -> Self:
-        if self.recording is None and any(part.message is not None for part in self.parts.values()):
+        sources = [*self.parts.values(), self.streams.imu.accel_source]
+        if self.recording is None and any(part is not None and part.message is not None for part in sources):
             raise ValueError("streams name messages, but `recording` does not say which file they are in")
         return self
 
