@@ -124,8 +124,8 @@ def loader(name: object) -> type[Recording]:
     Raises:
         DatasetError: unknown format (with the nearest known one), or its package cannot be loaded.
     """
-    if name in LOADERS:
-        module, kind = LOADERS[str(name)].split(":")
+    if isinstance(name, str) and name in LOADERS:
+        module, kind = LOADERS[name].split(":")
         return getattr(import_module(f".{module}", __package__), kind)
     known = known_formats()
     if name not in known:
