@@ -124,13 +124,13 @@ def test_what_a_log_holds_is_told_by_name_and_instance(voyage, written):
 
 @pytest.mark.parametrize("chunk_bytes", [1, 2, 3, 7, 64, 1000])
 def test_chunks_of_any_size_give_the_same_messages(tmp_path, monkeypatch, chunk_bytes):
-    data = bytearray(head() + b"".join(imu(i) for i in range(40)))
-    data[-500] ^= 0xFF
-    data[-900] = 0xA3
-    whole = times(tmp_path, bytes(data))
+    junk = {7: b"junk", 12: b"\xa3", 20: b"\xa3\x95", 21: b"\xa3\x95\x00", 30: imu(99)[:40]}
+    data = head() + b"".join(imu(i) + junk.get(i, b"") for i in range(40)) + b"\xa3"
+    whole = times(tmp_path, data)
+    assert whole[0] == [i for i in range(40) if i not in (7, 12)]
     monkeypatch.setattr(module, "CHUNK_BYTES", chunk_bytes)
     monkeypatch.setattr(module, "BATCH_BYTES", 100)
-    assert times(tmp_path, bytes(data)) == whole
+    assert times(tmp_path, data) == whole
 
 
 def test_bytes_between_messages_are_passed_over_and_told(tmp_path):
