@@ -121,7 +121,7 @@ class ArduPilotRecording(Recording):
                 rows = batch.rows if senders is None else batch.rows[senders == sender]
                 key = (batch.layout.name, sender)
                 count = len(rows) + (found[key].count if key in found else 0)
-                if "TimeUS" in batch.layout.fields and batch.layout.is_number("TimeUS"):
+                if "TimeUS" in batch.layout.fields and batch.layout.rows["TimeUS"].kind in "iu":
                     stamps = [int(rows["TimeUS"].min()), int(rows["TimeUS"].max()), *times.get(key, ())]
                     times[key] = (min(stamps), max(stamps))
                 first, last = times.get(key, (0, 0))

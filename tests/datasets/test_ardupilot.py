@@ -122,6 +122,14 @@ def test_what_a_log_holds_is_told_by_name_and_instance(voyage, written):
     assert held["IMU", 1].fields[:3] == ("TimeUS", "I", "GyrX")
 
 
+def test_a_time_that_is_no_whole_number_spans_nothing(tmp_path):
+    """A damaged letter makes the microseconds a float64, and these bits are no number."""
+    data = head() + definition("ATT", letters="dccccCCCCB") + message("ATT", 2**64 - 1, *[0.0] * 8, 0)
+    (tmp_path / FILE).write_bytes(data)
+    held = {h.message: h for h in ArduPilotRecording(format="ardupilot", file=FILE).contents(tmp_path)}
+    assert (held["ATT"].count, held["ATT"].span_s) == (1, 0.0)
+
+
 @pytest.mark.parametrize("chunk_bytes", [1, 2, 3, 7, 64, 1000])
 def test_chunks_of_any_size_give_the_same_messages(tmp_path, monkeypatch, chunk_bytes):
     junk = {7: b"junk", 12: b"\xa3", 20: b"\xa3\x95", 21: b"\xa3\x95\x00", 30: imu(99)[:40]}
