@@ -73,8 +73,8 @@ class Message(Part):
     names: Annotated[tuple[str, ...], Field(min_length=1)]
     """Joined where their device clocks agree when there are several; columns are then `Name.field`."""
     entity: int | None = None
-    """Which of several senders of that name: `src_ent` in IMC, any when left out; the instance in ArduPilot, where it may
-    be left out only if there is one."""
+    """Which of several senders of that name: `src_ent` in IMC, any when left out; the instance in ArduPilot, where
+    it may be left out only if there is one."""
     clock: DeviceClock | None = None
     """Adds the column `device`: this clock, unwrapped and put onto the host's, s."""
 
