@@ -1,0 +1,123 @@
+"""One experiment file over the recorded logs and over one simulated log in every format that Fathom reads."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from fathom.bench.cli import app
+from fathom.bench.store import load_runs
+from fathom.datasets import Log, Scenario, Trajectory, catalog_names, open_log, simulate
+from fathom.datasets.folder import write_folder
+from fathom.datasets.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from typer.testing import CliRunner
+from written import WRITERS
+from written_ardupilot import write_ardupilot
+from written_imc import write_arrays, write_imc
+
+ORIGIN_DEG = (41.18, -8.7)
+
+
+def places(p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return latitude and longitude (rad) of the points of the ellipsoid above or below p_W, found by iteration."""
+    latitude, longitude = (np.array(np.radians(x)) for x in ORIGIN_DEG)
+    start, axes = ecef_from_geodetic(latitude, longitude, np.array(0.0)), enu_axes(latitude, longitude)
+    local = p_W * [1.0, 1.0, 0.0]
+    for _ in range(5):
+        lat, lon, height = geodetic_from_ecef(start + local @ axes)
+        local[:, 2] -= height
+    return lat, lon
+
+
+def write_tum(log: Log, folder: Path) -> Path:
+    """Tables of ours, and the truth as a TUM file."""
+    write_folder(log, folder)
+    assert log.truth is not None
+    described = yaml.safe_load((folder / "log.yaml").read_text())
+    (folder / described["truth"].pop("trajectory")).unlink()
+    described["truth"]["tum"] = "truth.tum"
+    log.truth.to_tum(folder / "truth.tum")
+    (folder / "log.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
+    return folder
+
+
+EXACT: dict[str, Any] = {
+    "parquet": write_folder,
+    "csv": lambda log, folder: write_folder(log, folder, "csv"),
+    "arrays": write_arrays,
+    **WRITERS,
+}
+"""Formats that hold a log bit for bit."""
+NEARLY: dict[str, Any] = {
+    "tum": write_tum,
+    "imc": lambda log, folder: write_imc(log, folder, places),
+    "ardupilot": write_ardupilot,
+}
+"""Formats of geodetic places, float32 samples or a device's clock: scores agree to millimetres."""
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    simulated = simulate(Scenario(mission="lawnmower", duration_s=60, imu="industrial"), seed=2)
+    return replace(simulated, prior=None, origin=ORIGIN_DEG)  # most formats hold no prior: every log starts alike
+
+
+@pytest.mark.slow
+def test_all_logs_go_through_one_experiment_and_a_format_changes_no_score(
+    log: Log, tmp_path: Path, recorded_data: Path
+) -> None:
+    for name, write in (EXACT | NEARLY).items():
+        write(log, tmp_path / name)
+    estimators = [{"name": "eskf"}, {"name": "fls", "with": {"lag_s": 3.0}}]
+    written = [{"log": str(tmp_path / name), "name": name} for name in EXACT | NEARLY]
+    recorded = [{"log": name, "align": "yaw"} for name in catalog_names()]
+    plan = {"logs": written + recorded, "estimators": estimators}
+    (tmp_path / "formats.yaml").write_text(yaml.safe_dump(plan))
+    arguments = ["run", str(tmp_path / "formats.yaml"), "--data", str(recorded_data), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output[-2000:]
+    rows = load_runs(tmp_path / "out" / "formats")
+    assert set(rows["status"]) == {"done"}
+    assert len(rows) == 3 * (len(written) + len(recorded))  # online twice, and the hindsight of fls
+    ate = rows.pivot_table(index="log", columns=["label", "output"], values="ate_rmse_m")
+    assert len(recorded) >= 4
+    ours = ate.loc["parquet"]
+    assert ours.between(0.01, 5).all()
+    for name in EXACT:
+        assert (ate.loc[name] == ours).all(), name
+    for name in NEARLY:
+        assert (np.abs(ate.loc[name] - ours) < 2e-3).all(), name
+    assert ate.loc[catalog_names()].lt(10).all().all()
+    starts = {json.loads(notes)[-1] for notes in rows["notes"]}
+    assert starts
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_a_log_comes_back_bit_for_bit(log: Log, tmp_path: Path, name: str) -> None:
+    read = open_log(EXACT[name](log, tmp_path / name))
+    assert read.streams.keys() == log.streams.keys()
+    for field in ("t_ns", "w_WI_I", "f_I"):
+        np.testing.assert_array_equal(getattr(read.imu, field), getattr(log.imu, field), strict=True)
+    for sensor, stream in log.streams.items():
+        for field in ("t_ns", "received_ns", "z", "sigma"):
+            np.testing.assert_array_equal(getattr(read.streams[sensor], field), getattr(stream, field), strict=True)
+
+
+@pytest.mark.parametrize("name", NEARLY)
+def test_a_log_comes_back_as_exactly_as_the_format_can(log: Log, tmp_path: Path, name: str) -> None:
+    read = open_log(NEARLY[name](log, tmp_path / name))
+    np.testing.assert_array_equal(read.imu.t_ns, log.imu.t_ns)
+    np.testing.assert_allclose(read.imu.f_I, log.imu.f_I, atol=1e-6)
+    np.testing.assert_allclose(read.imu.w_WI_I, log.imu.w_WI_I, atol=1e-7)
+    tolerance = {"dvl": 1e-6, "depth": 1e-5, "gps": 0.02, "heading": 2e-4}  # ardupilot: 1e-7 deg, 0.01 deg
+    for sensor, stream in log.streams.items():
+        np.testing.assert_array_equal(read.streams[sensor].t_ns, stream.t_ns)
+        np.testing.assert_allclose(read.streams[sensor].z, stream.z, atol=tolerance[sensor])
+    assert isinstance(read.truth, Trajectory)
+    assert log.truth is not None
+    np.testing.assert_allclose(read.truth.p_WB_W, log.truth.p_WB_W, atol=0.02)
