@@ -24,6 +24,8 @@ from .errors import DatasetError, nearest
 LOADERS = {
     "ardupilot": "ardupilot:ArduPilotRecording",
     "imc": "imc:ImcRecording",
+    "mcap": "mcap_file:McapRecording",
+    "ros": "ros_bag:RosRecording",
 }
 """Our formats: module and class. Other people's join by the entry-point group `fathom.loaders`."""
 
