@@ -41,10 +41,14 @@ class McapRecording(TopicRecording):
         return mcap_messages(self.path(folder), {}, topics, found)
 
 
-def mcap_messages(path: Path, types: Types, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+def mcap_messages(
+    plain: Path, types: Types, topics: Collection[str] | None, found: Found, path: Path | None = None
+) -> Iterator[Message]:
     """Yield the messages of an MCAP file; what is damaged is passed over and told in `found.notes`.
 
     Args:
+        plain: the file.
+        path: what errors call it, where that is not its path.
         types: definitions of ROS messages that the file does not define itself.
 
     Raises:
@@ -54,10 +58,11 @@ def mcap_messages(path: Path, types: Types, topics: Collection[str] | None, foun
         from mcap.records import Chunk, Footer
         from mcap.records import Message as Record
         from mcap.stream_reader import StreamReader, get_chunk_data_stream
+    path = plain if path is None else path
     reading = _Reading(path, types, topics, found)
     finished, damaged = False, 0
     try:
-        stream = path.open("rb")
+        stream = plain.open("rb")
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
     with stream:
@@ -65,7 +70,7 @@ def mcap_messages(path: Path, types: Types, topics: Collection[str] | None, foun
         if magic != MAGIC:
             what = f"it begins with {magic!r}" if magic else "an empty file"
             raise DatasetError(f"{path}: not an MCAP file: {what}")
-        size = path.stat().st_size
+        size = plain.stat().st_size
         records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=size).records
         why = "the end of the file"
         while True:

@@ -28,7 +28,7 @@ from .topics import NS, Channel, Found, Message, TopicRecording
 MAGIC_1 = b"#ROSBAG V2.0\n"
 MESSAGE_DATA, CHUNK, CONNECTION = 2, 5, 7
 """Kinds of records of a ROS 1 bag, their `op`."""
-NEWEST_KNOWN = "humble"
+DISTRO = "humble"
 """The ROS 2 distribution whose definitions are taken where a bag does not name one."""
 _U32 = struct.Struct("<I")
 
@@ -87,9 +87,10 @@ def shipped_definitions() -> dict[str, Definition]:
 class _Distribution(dict[str, Definition]):
     """Definitions that a ROS 2 distribution brings, looked up when they are asked for."""
 
-    def __init__(self, distro: str, where: str) -> None:
+    def __init__(self, asked: str | None, recorded: str, where: str) -> None:
+        """`asked` is the user's; else that of the recording counts where it is known (it may say `rolling`)."""
         super().__init__()
-        self.distro, self.where = distro, where
+        self._asked, self._recorded, self._where = asked, recorded, where
 
     def __missing__(self, kind: str) -> Definition:
         store = self._store()
@@ -97,17 +98,18 @@ class _Distribution(dict[str, Definition]):
         if name not in store.fielddefs:
             raise KeyError(kind)
         text, _ = store.generate_msgdef(name, ros_version=2)
-        self.update(parse_definitions(text, kind, self.where))
+        self.update(parse_definitions(text, kind, self._where))
         return self[kind]
 
     def _store(self) -> Any:
         with extra("ros"):
             from rosbags.typesys import Stores, get_typestore
         known = {store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")}
-        if self.distro not in known:
-            hint = nearest(self.distro, known)
-            raise DatasetError(f"{self.where}: no ROS 2 distribution {self.distro!r}{hint} (known: {', '.join(known)})")
-        return get_typestore(known[self.distro])
+        distro = self._asked or (self._recorded if self._recorded in known else DISTRO)
+        if distro not in known:
+            hint = nearest(distro, known)
+            raise DatasetError(f"{self._where}: no ROS 2 distribution {distro!r}{hint} (known: {', '.join(known)})")
+        return get_typestore(known[distro])
 
 
 # ------------------------------------------------------------------------------------------------------------- ROS 1
@@ -277,15 +279,15 @@ def _ros2_messages(
 ) -> Iterator[Message]:
     about = _metadata(path) if path.is_dir() else {}
     files = _files(path, about) if path.is_dir() else [path]
-    known = Definitions(types, _Distribution(_distro(about, distro), str(path)))
-    compressed = about.get("compression_mode", "").upper() == "MESSAGE"
+    known = Definitions(types, _Distribution(distro, str(about.get("ros_distro")), str(path)))
+    compressed = str(about.get("compression_mode")).upper() == "MESSAGE"
     yielded = False
     problems = []
     for file in files:
         with _uncompressed(file) as plain:
             read = _sqlite_messages if plain.suffix == ".db3" else _mcap_messages
             try:
-                for channel, stamps, data in read(plain, known, topics, found):
+                for channel, stamps, data in read(plain, file, known, topics, found):
                     yielded = True
                     yield channel, stamps, _zstd(data) if compressed and topics is not None else data
             except DatasetError as error:  # a note where there are other messages, of this file or another
@@ -325,10 +327,6 @@ def _files(path: Path, about: Mapping[str, Any]) -> list[Path]:
     return files
 
 
-def _distro(about: Mapping[str, Any], distro: str | None) -> str:
-    return distro or str(about.get("ros_distro") or "") or NEWEST_KNOWN
-
-
 @contextmanager
 def _uncompressed(file: Path) -> Iterator[Path]:
     """Yield the file, or what a `.zstd` holds, in a temporary one."""
@@ -357,10 +355,13 @@ def _zstd(data: bytes) -> bytes:
         return b""
 
 
-def _sqlite_messages(path: Path, types: Types, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+def _sqlite_messages(
+    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: Found
+) -> Iterator[Message]:
+    """Yield the messages of a SQLite database; `path` is what errors call it, `plain` where it lies uncompressed."""
     row = before = 0
     try:
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+        with closing(sqlite3.connect(f"{plain.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
             database.text_factory = lambda text: text.decode(errors="replace")
             channels = _sqlite_channels(database, path, types)
             found.channels += channels.values()
@@ -411,8 +412,10 @@ def _cdr_channel(topic: str, kind: str, carried: tuple[str, str] | None, types: 
     return ros_channel(topic, short_name(kind), known, "cdr", where)
 
 
-def _mcap_messages(path: Path, types: Types, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
-    for channel, (log_ns, _), data in mcap_messages(path, types, topics, found):
+def _mcap_messages(
+    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: Found
+) -> Iterator[Message]:
+    for channel, (log_ns, _), data in mcap_messages(plain, types, topics, found, path):
         yield channel, (log_ns,), data
 
 

@@ -46,18 +46,19 @@ Serialisation = Literal["ros1", "cdr"]
 
 
 class Definitions(dict[str, Definition]):
-    """Definitions by their short names; what is not among them is asked of others, in turn."""
+    """Definitions by their short names, out of several sources: the first that has one counts."""
 
-    def __init__(self, own: Types, *others: Types) -> None:
-        super().__init__(own)
-        self._others = others
+    def __init__(self, *sources: Types) -> None:
+        super().__init__()
+        self._sources = sources
 
     def __missing__(self, kind: str) -> Definition:
-        for other in self._others:
+        for source in self._sources:
             try:
-                return other[kind]
+                self[kind] = source[kind]
             except KeyError:
                 continue
+            return self[kind]
         raise KeyError(kind)
 
 
