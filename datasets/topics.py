@@ -216,7 +216,9 @@ class _Table:
                 f"{self.where}: {len(self.misfits)} of {count} messages are not what {kind} is defined as, the first "
                 f"is message {row}: {why}; is the definition that of the recording?"
             )
-        return [f"{self.want.message}: {len(self.misfits)} damaged messages passed over, the first is message {row}"]
+        return [
+            f"{self.want.message}: {len(self.misfits)} damaged messages passed over, the first is message {row}: {why}"
+        ]
 
     def columns(self) -> Mapping[str, NDArray[Any]]:
         """Return the wanted columns, in the order of the container's first stamp."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import sqlite3
 import struct
 import sys
@@ -26,7 +25,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from written import copied, first_seconds, ros_store, write_ros1, write_ros2
+from written import assert_the_same, copied, damaged, first_seconds, ros_store, write_ros1, write_ros2
 
 NS = 1_000_000_000
 
@@ -39,15 +38,6 @@ def log() -> Log:
 @pytest.fixture(scope="session")
 def small(log: Log) -> Log:
     return first_seconds(log, 2.5)
-
-
-def assert_the_same(a: Log, b: Log) -> None:
-    for name in ("t_ns", "w_WI_I", "f_I"):
-        np.testing.assert_array_equal(getattr(a.imu, name), getattr(b.imu, name), strict=True)
-    assert a.streams.keys() == b.streams.keys()
-    for name, stream in a.streams.items():
-        for field in ("t_ns", "received_ns", "z", "sigma"):
-            np.testing.assert_array_equal(getattr(stream, field), getattr(b.streams[name], field), strict=True)
 
 
 def read(folder: Path, topic: str, *columns: str, **options: Any) -> dict[str, Any]:
@@ -398,27 +388,6 @@ def fuzzed(small, ros1, tmp_path_factory):
     bags["sqlite"] = (write_ros2(small, folder / "sqlite"), "bag/bag.db3")
     bags["metadata"] = (write_ros2(small, folder / "metadata", "mcap"), "bag/metadata.yaml")
     return {name: (folder, folder / file, (folder / file).read_bytes()) for name, (folder, file) in bags.items()}
-
-
-def damaged(data: bytes, seed: int) -> bytes:
-    """The same bytes, some of them flipped, overwritten, cut out, put in, or cut off."""
-    rng, mutable = random.Random(seed), bytearray(data)
-    for _ in range(rng.choice([1, 1, 2, 6])):
-        at = min(int(len(mutable) * rng.random() ** rng.choice([1, 4])), len(mutable) - 1)
-        how = rng.randrange(5)
-        if how == 0:
-            mutable[at] ^= 1 << rng.randrange(8)
-        elif how == 1:
-            mutable[at : at + 4] = rng.choice([bytes(4), b"\xff" * 4, rng.randbytes(4)])
-        elif how == 2:
-            del mutable[at : at + rng.randrange(1, 200)]
-        elif how == 3:
-            mutable[at:at] = rng.randbytes(rng.randrange(1, 60))
-        else:
-            del mutable[max(at, 1) :]
-        if not mutable:
-            break
-    return bytes(mutable)
 
 
 @settings(max_examples=80, deadline=None, derandomize=True)

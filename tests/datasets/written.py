@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import random
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 from fathom.datasets import Log
 from fathom.datasets.folder import write_folder
@@ -93,8 +95,6 @@ def ros_store(version: Literal[1, 2]) -> Any:
 
 def ros_messages(log: Log, store: Any, version: Literal[1, 2]) -> Iterator[tuple[str, int, Any]]:
     """Stream, record time and message of every row."""
-    import numpy as np
-
     types = store.types
     Imu, Reading = types["sensor_msgs/msg/Imu"], types["fathom_msgs/msg/Reading"]
     Vector3, Quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
@@ -275,3 +275,33 @@ def copied(source: Path, target: Path) -> Path:
     """A copy of a written log, to be damaged."""
     shutil.copytree(source, target)
     return target
+
+
+def assert_the_same(a: Log, b: Log) -> None:
+    for name in ("t_ns", "w_WI_I", "f_I"):
+        np.testing.assert_array_equal(getattr(a.imu, name), getattr(b.imu, name), strict=True)
+    assert a.streams.keys() == b.streams.keys()
+    for name, stream in a.streams.items():
+        for field in ("t_ns", "received_ns", "z", "sigma"):
+            np.testing.assert_array_equal(getattr(stream, field), getattr(b.streams[name], field), strict=True)
+
+
+def damaged(data: bytes, seed: int) -> bytes:
+    """The same bytes, some of them flipped, overwritten, cut out, put in, or cut off."""
+    rng, mutable = random.Random(seed), bytearray(data)
+    for _ in range(rng.choice([1, 1, 2, 6])):
+        at = min(int(len(mutable) * rng.random() ** rng.choice([1, 4])), len(mutable) - 1)
+        how = rng.randrange(5)
+        if how == 0:
+            mutable[at] ^= 1 << rng.randrange(8)
+        elif how == 1:
+            mutable[at : at + 4] = rng.choice([bytes(4), b"\xff" * 4, rng.randbytes(4)])
+        elif how == 2:
+            del mutable[at : at + rng.randrange(1, 200)]
+        elif how == 3:
+            mutable[at:at] = rng.randbytes(rng.randrange(1, 60))
+        else:
+            del mutable[max(at, 1) :]
+        if not mutable:
+            break
+    return bytes(mutable)
