@@ -262,6 +262,14 @@ def test_an_unfinished_bag_gives_what_is_whole_and_says_so(log, tmp_path):
     assert any("log.bag: cut off" in note for note in cut.notes)
 
 
+def test_a_cut_chunk_gives_its_whole_messages(small, ros1, tmp_path):
+    folder = copied(ros1, tmp_path / "x")  # so short that it is one chunk
+    data = (folder / "log.bag").read_bytes()
+    (folder / "log.bag").write_bytes(data[: len(data) // 2])
+    n = len(read(folder, "/imu", "log_time", file="log.bag")["log_time"])
+    assert 0.3 < n / len(small.imu.t_ns) < 0.7
+
+
 def test_a_bag_without_an_index_reads_like_one_with(small, ros1, tmp_path):
     folder = copied(ros1, tmp_path / "x")
     data = (folder / "log.bag").read_bytes()
