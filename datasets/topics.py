@@ -161,9 +161,17 @@ class TopicRecording(Recording):
             _, count, first, last = spans.get(channel.topic, (channel, 0, stamps[0], stamps[0]))
             spans[channel.topic] = channel, count + 1, min(first, stamps[0]), max(last, stamps[0])
         return [
-            Held(topic, channel.kind, count, (last - first) / NS, channel.fields())
+            Held(topic, channel.kind, count, (last - first) / NS, _fields(channel))
             for topic, (channel, count, first, last) in sorted(spans.items())
         ]
+
+
+def _fields(channel: Channel) -> tuple[str, ...]:
+    """Return the numeric fields of a topic; none where its type is not defined, which is an error only when read."""
+    try:
+        return channel.fields()
+    except DatasetError:
+        return ()
 
 
 class _Table:
@@ -174,7 +182,7 @@ class _Table:
         self.fields = [column for column in want.columns if column not in stamps]
         self.channels: dict[Channel, Extractor] = {}
         self.rows: Rows | None = None
-        self.misfits: list[tuple[int, str]] = []
+        self.misfits, self.first_misfit = 0, ""
 
     def add(self, channel: Channel, stamps: tuple[int, ...], data: bytes) -> None:
         extract = self.channels.get(channel) or self._opened(channel)
@@ -183,10 +191,11 @@ class _Table:
         try:
             rows.append((*stamps, *extract(data)))
         except ShortArray as error:
-            row = len(rows) + len(self.misfits)
+            row = len(rows) + self.misfits
             raise DatasetError(f"{self.where}: message {row}: {error}, and more are asked for") from None
         except (Misfit, struct.error, RecursionError) as error:
-            self.misfits.append((len(rows) + len(self.misfits), str(error)))
+            self.first_misfit = self.first_misfit or f"message {len(rows)}: {error}"
+            self.misfits += 1
 
     def _opened(self, channel: Channel) -> Extractor:
         extract = channel.extractor(self.fields)
@@ -208,17 +217,14 @@ class _Table:
         if not self.misfits:
             return []
         assert self.rows is not None
-        row, why = self.misfits[0]
         kind = next(iter(self.channels)).kind
-        if len(self.misfits) > len(self.rows):
-            count = len(self.misfits) + len(self.rows)
+        if self.misfits > len(self.rows):
+            count = self.misfits + len(self.rows)
             raise DatasetError(
-                f"{self.where}: {len(self.misfits)} of {count} messages are not what {kind} is defined as, the first "
-                f"is message {row}: {why}; is the definition that of the recording?"
+                f"{self.where}: {self.misfits} of {count} messages are not what {kind or 'their type'} is defined as, "
+                f"the first is {self.first_misfit}; is the definition that of the recording?"
             )
-        return [
-            f"{self.want.message}: {len(self.misfits)} damaged messages passed over, the first is message {row}: {why}"
-        ]
+        return [f"{self.want.message}: {self.misfits} damaged messages passed over, the first is {self.first_misfit}"]
 
     def columns(self) -> Mapping[str, NDArray[Any]]:
         """Return the wanted columns, in the order of the container's first stamp."""

@@ -178,6 +178,17 @@ def test_json_numbers_stay_integers_until_one_is_not(tmp_path):
         read(tmp_path, "/j", "t.sec.x")
 
 
+def test_a_topic_of_two_types_is_refused(tmp_path):
+    def write(writer: Writer) -> None:
+        for i, kind in enumerate(("a.A", "b.B")):
+            schema = writer.register_schema(kind, "jsonschema", b"{}")
+            writer.add_message(writer.register_channel("/t", "json", schema), i, b'{"x": 1}', i)
+
+    write_plain(tmp_path, write)
+    with pytest.raises(DatasetError, match=r"/t: messages of two types, a\.A and b\.B"):
+        read(tmp_path, "/t", "x")
+
+
 def test_an_encoding_that_is_not_supported_is_named(tmp_path):
     def write(writer: Writer) -> None:
         writer.add_message(writer.register_channel("/f", "flatbuffer", 0), 1, b"x", 1)

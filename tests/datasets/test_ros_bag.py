@@ -221,6 +221,9 @@ def test_a_type_nobody_knows_names_the_option_that_helps(small, tmp_path):
         DatasetError, match=r"no definition of the type fathom_msgs/Reading; name its \.msg.*`definitions`"
     ):
         open_log(folder)
+    held = {h.message: h for h in RosRecording(format="ros", file="bag").contents(folder)}
+    assert (held["/dvl"].kind, held["/dvl"].fields) == ("fathom_msgs/Reading", ())
+    assert "angular_velocity.x" in held["/imu"].fields
     (folder / "fathom_msgs" / "msg").mkdir(parents=True)
     (folder / "fathom_msgs" / "msg" / "Reading.msg").write_text(
         "std_msgs/Header header\nfloat64[] z\nfloat64[] sigma\n"
