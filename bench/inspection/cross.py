@@ -1,0 +1,33 @@
+"""What the sensors of a log say of each other: the cross-sensor checks, each where its sensors are there."""
+
+from __future__ import annotations
+
+from ...datasets.log import Log
+from .answers import Answer
+from .clock import clock_check
+from .findings import Check
+from .headings import gyro_against_heading, heading_against_truth
+from .inertial import inertial_of
+from .lever_arm import imu_against_dvl
+from .references import depth_against_truth, dvl_against_truth, gps_against_truth, truth_against_itself
+from .velocity import dvl_against_positions, positions
+
+
+def cross_checks(log: Log) -> list[Check]:
+    """Return a check for every pair of sensors that see the same; those that are absent, or too short, are left out.
+
+    Every estimate comes with a standard deviation that the data tell (`fitting`). A finding is raised where it differs
+    from what the description says beyond chance and by a size that matters. What to put into log.yaml comes on top of
+    what stands there: offsets and delays add, scales multiply.
+    """
+    imu = inertial_of(log)
+    answers: list[Answer | None] = []
+    if log.heading is not None:
+        answers += [gyro_against_heading(log, imu), heading_against_truth(log)]
+    if log.dvl is not None:
+        answers += [dvl_against_positions(log, imu, where) for where in positions(log, imu)]
+        answers += [dvl_against_truth(log, imu), imu_against_dvl(log, imu)]
+    answers += [gps_against_truth(log), depth_against_truth(log), truth_against_itself(log)]
+    met = [answer for answer in answers if answer is not None]
+    delays = [delay for answer in met for delay in answer.delays]
+    return [*(answer.check for answer in met), clock_check(log, delays)]
