@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 DELAY_MATTERS_S = 0.05
 TRUTH_DELAY_MATTERS_S = 0.1
+WELL_KNOWN_S = 0.2
 FLOOR_S = 0.005
 """No delay is believed beyond this: half a sample of a fast IMU."""
 PARTS = ("truth position", "truth velocity", "truth attitude")
@@ -75,7 +76,8 @@ def clock_check(log: Log, delays: Sequence[Delay]) -> Check:
     findings = []
     off = {n: e for n, e in story.late.items() if e.differs(0.0, _matters(n))}
     sensors = {n: e for n, e in story.late.items() if n not in PARTS}
-    common = _common(sensors) if len(story.late) > 1 and len(sensors) > 1 and set(sensors) <= set(off) else None
+    known = {n for n, e in sensors.items() if e.known_to(WELL_KNOWN_S)}
+    common = _common(sensors) if len(known) > 1 and known <= set(off) else None
     if common is not None:
         says = (
             f"Every other stream is {_late(common)} by the IMU's clock, and they agree among themselves: it is the "

@@ -8,7 +8,7 @@ from .clock import clock_check
 from .findings import Check
 from .headings import gyro_against_heading, heading_against_truth
 from .inertial import inertial_of
-from .lever_arm import imu_against_dvl
+from .lever_arm import imu_against_dvl, mirrored_dvl
 from .references import depth_against_truth, dvl_against_truth, gps_against_truth, truth_against_itself
 from .velocity import dvl_against_positions, positions
 
@@ -25,6 +25,9 @@ def cross_checks(log: Log) -> list[Check]:
     if log.heading is not None:
         answers += [gyro_against_heading(log, imu), heading_against_truth(log)]
     if log.dvl is not None:
+        if (mirrored := mirrored_dvl(log, imu)) is not None:
+            answer, log = mirrored  # the other checks go on with what it means
+            answers.append(answer)
         answers += [dvl_against_positions(log, imu, where) for where in positions(log, imu)]
         answers += [dvl_against_truth(log, imu), imu_against_dvl(log, imu)]
     answers += [gps_against_truth(log), depth_against_truth(log), truth_against_itself(log)]

@@ -1,4 +1,4 @@
-"""The heading sensor against the gyro, and against the truth: signs, units, bias, delay, offset, a disturbed compass."""
+"""The heading sensor against the gyro, and against the truth: signs, units, bias, delay, offset, disturbance."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from .fitting import (
     without_trend,
 )
 from .inertial import Inertial, headings, seconds
+from .velocity import fit_path, positions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +32,8 @@ DEGREE = np.pi / 180
 WINDOW_S = 60.0
 LAGS_S = np.arange(-3.0, 3.01, 0.25)
 SLOPE_MATTERS = 0.03
+FOLLOWS = 0.7
+"""Least length of the mean of e^{i error}: 1 for none, 0 for errors all around."""
 OFFSET_MATTERS = 1.0 * DEGREE
 SLOW_MATTERS = 0.5 * DEGREE
 OVERCONFIDENT = 2.0
@@ -91,7 +94,7 @@ def fit_gyro_to_heading(log: Log, imu: Inertial) -> GyroHeading | None:
 def _turns(
     t_s: Array, psi: Array, imu: Inertial, theta: Array, window_s: float, degree: int, delay_s: float | None
 ) -> tuple[Fit, float] | None:
-    """Return the fit of the heading by the integrated gyro and the delay (s), from a coarse grid where none is given."""
+    """Return the fit of the heading by the turned gyro, and the delay (s), from a coarse grid where none is given."""
     window = windows_of(t_s, window_s, 5.0)
     block = blocks_of_windows(window)
     y = without_trend(psi, t_s, window, degree)
@@ -136,8 +139,8 @@ def gyro_against_heading(log: Log, imu: Inertial) -> Answer | None:
     facts["axis of B that turns with the heading"] = f"{axis} (correlation {abs(correlation):.2f})"
     facts["heading by gyro, slope"] = found.slope.text() if turning else "not observable: the vehicle hardly turns"
     if turning:
-        findings += _slope_findings(found, correlation)
-        findings += _axis_findings(axis, correlation, imu)
+        findings += _slope_findings(log, imu, found, correlation)
+        findings += _axis_findings(log, axis, correlation, imu)
         facts["gyro bias about the vertical"] = found.bias.text("rad/s")
         facts["heading later than the IMU by"] = found.delay.text_if(0.5, "s")
         stated = log.rig.imu_noise.gyro_bias_sigma
@@ -185,44 +188,69 @@ def _turning_axis(log: Log, found: GyroHeading) -> tuple[str, float]:
     return ("−" if correlations[best] < 0 else "") + "xyz"[best], correlations[best]
 
 
-def _slope_findings(found: GyroHeading, correlation: float) -> list[Finding]:
-    slope = found.slope
-    size = abs(slope.value)
-    findings = []
-    if slope.value < 0 and slope.differs(0.0, 0.0) and abs(correlation) > 0.5:
-        findings.append(
-            Finding(
-                "heading",
-                f"The heading turns against the gyro (slope {slope.text()}): a compass is read as a yaw or a yaw as a "
-                "compass, or the gyro is mirrored (then `streams.imu.gyro.scale` of the axis that is up, times -1).",
-                "streams.heading.convention: the other one of compass and yaw",
-            )
+def _slope_findings(log: Log, imu: Inertial, found: GyroHeading, correlation: float) -> list[Finding]:
+    slope, size = found.slope, abs(found.slope.value)
+    if np.ptp(found.psi) < 2.05 * np.pi * DEGREE and np.ptp(imu.turned()) > 1.0:
+        says = (
+            f"The heading stays within {np.degrees(np.ptp(found.psi)):.1f}° while the gyro turns: radians as degrees."
         )
-    for ratio, unit, other in ((np.pi / 180, "deg/s", "rad"), (180 / np.pi, "rad/s", "deg")):
+        return [Finding("heading", says, "streams.heading.heading.unit: rad")]
+    for ratio, gyro, heading in ((DEGREE, "deg/s", "rad"), (1 / DEGREE, "rad/s", "deg")):
         if abs(size / ratio - 1) < 0.3 and slope.known_to(0.3 * ratio):
-            gyro = np.ptp(found.psi) > 0.12 or unit == "rad/s"
-            findings.append(
-                Finding(
-                    "imu" if gyro else "heading",
-                    f"The heading turns {slope.text()} times as far as the gyro, which is the ratio of degrees and "
-                    "radians: a unit is wrong, of the gyro or of the heading.",
-                    f"streams.imu.gyro.unit: {unit}" if gyro else f"streams.heading.heading.unit: {other}",
-                )
+            says = (
+                f"The heading turns {slope.text()} times as far as the gyro, which is the ratio of degrees and "
+                "radians: a unit is wrong, the gyro's, or else the heading's "
+                f"(`streams.heading.heading.unit: {heading}`)."
             )
-            return findings
-    if not findings and slope.differs(1.0, SLOPE_MATTERS):
-        findings.append(
-            Finding(
-                "imu",
-                f"The heading turns {slope.text()} times as far as the gyro: the gyro's scale is off, or the compass "
-                "deviates with the heading.",
-                f"streams.imu.gyro.scale: {slope.value:.3g}",
-            )
-        )
-    return findings
+            return [Finding("imu", says, f"streams.imu.gyro.unit: {gyro}")]
+    if not slope.differs(1.0, SLOPE_MATTERS) or abs(correlation) < 0.5:
+        return []
+    right = _gyro_is_right(log, imu)
+    if slope.value < 0:
+        says = f"The heading turns against the gyro (slope {slope.text()}): "
+        if right is False:
+            up = int(np.argmax(np.abs(np.asarray(log.rig.imu.R_BS)[2])))
+            scale = ", ".join("-1" if i == up else "1" for i in range(3))
+            says += "the gyro is mirrored, for the positions follow the heading."
+            return [Finding("imu", says, f"streams.imu.gyro.scale: [{scale}]")]
+        says += "a compass is read as a yaw, or a yaw as a compass"
+        says += "." if right else "; or the gyro is mirrored."
+        return [Finding("heading", says, "streams.heading.convention: yaw  # or compass, whichever it is not")]
+    says = f"The heading turns {slope.text()} times as far as the gyro: "
+    if right is False:
+        return [Finding("imu", says + "the gyro's scale is off.", f"streams.imu.gyro.scale: {slope.value:.4g}")]
+    says += "the compass deviates with the heading" + ("." if right else ", or else the gyro's scale is off.")
+    return [Finding("heading", says)]
 
 
-def _axis_findings(axis: str, correlation: float, imu: Inertial) -> list[Finding]:
+def _gyro_is_right(log: Log, imu: Inertial) -> bool | None:
+    """Whether a third witness takes the gyro's side against the heading: the truth's attitude, else positions."""
+    yaw = _truth_yaw(log)
+    if yaw is not None:
+        fit = _turns(*yaw, imu, imu.turned(), (yaw[0][-1] - yaw[0][0]) / BLOCKS, 0, 0.0)
+        if fit is not None and fit[0]["slope"].known_to(0.3):
+            return not fit[0]["slope"].differs(1.0, SLOPE_MATTERS)
+    if log.dvl is not None:
+        for where in positions(log, imu):
+            path = fit_path(log, imu, where, "heading")
+            if path is not None and (path.mirrored or path.scale.known_to(0.3)):
+                return path.mirrored
+    return None
+
+
+def _truth_yaw(log: Log) -> tuple[Array, Array] | None:
+    """Return when (n,) s, and the azimuth (n,) rad of B's x axis by the truth, unwrapped; None where it has none."""
+    if log.truth is None:
+        return None
+    known = np.isfinite(log.truth.R_WB).all(axis=(1, 2))
+    t_s, R = seconds(log, log.truth.t_ns[known]), log.truth.R_WB[known]
+    if len(t_s) < 30:
+        return None
+    stride = max(len(t_s) // MOST_ROWS, 1)
+    return t_s[::stride], np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))[::stride]
+
+
+def _axis_findings(log: Log, axis: str, correlation: float, imu: Inertial) -> list[Finding]:
     if axis.lstrip("−") == "z" or abs(correlation) < 0.7:
         return []
     return [
@@ -231,7 +259,7 @@ def _axis_findings(axis: str, correlation: float, imu: Inertial) -> list[Finding
             f"The turn is on axis {axis} of B as described, not on z (correlation {abs(correlation):.2f}), and the "
             f"accelerometers' mean up is ({imu.up_B[0]:.2f}, {imu.up_B[1]:.2f}, {imu.up_B[2]:.2f}) there: the IMU's "
             "mounting or axes are wrong.",
-            "streams.imu.mounting: " + mounting_text(imu.R_LB @ np.eye(3), None),
+            "streams.imu.mounting: " + mounting_text(imu.R_LB @ np.asarray(log.rig.imu.R_BS), None),
         )
     ]
 
@@ -345,8 +373,10 @@ def heading_against_truth(log: Log) -> Answer | None:
     aligned, mirrored = (abs(np.exp(1j * (psi - sign * true)).mean()) for sign in (1, -1))
     if mirrored > 0.95 and mirrored > aligned + 0.05:
         says = f"The heading turns against the {whose}'s: a compass is read as a yaw, or a yaw as a compass."
-        finding = Finding("heading", says, "streams.heading.convention: the other one of compass and yaw")
+        finding = Finding("heading", says, "streams.heading.convention: yaw  # or compass, whichever it is not")
         return Answer(Check(f"heading against {whose}", {"turns": "the other way"}, (finding,)))
+    if aligned < FOLLOWS:
+        return Answer(Check(f"heading against {whose}", {"turns": f"not with the {whose}"}))
     middle = float(np.angle(np.exp(1j * (psi - true)).mean()))
     error = np.angle(np.exp(1j * (psi - true - middle)))
     block = blocks_of(len(t_s))
@@ -366,7 +396,7 @@ def heading_against_truth(log: Log) -> Answer | None:
         findings.append(
             Finding(
                 "heading",
-                f"The heading is {offset.times(1 / DEGREE).text('°')} counter-clockwise of the {whose}'s, constantly: "
+                f"The heading is {offset.times(1 / DEGREE).text('°')} counter-clockwise of the {whose}'s, on average: "
                 "declination, deviation or mounting.",
                 f"streams.heading.add_deg: {add:.1f}  # convention: compass; with yaw {-add:.1f}",
             )

@@ -1,20 +1,20 @@
 """The IMU against the DVL: delay, mounting, lever arm, from velocities alone.
 
 The IMU's velocity over ground is v_I = v_B + w × p. In a frame that does not turn, it changes by specific force and
-gravity: R (A z + w × p) = V + v_0 + g t, with R the integrated gyro, V = ∫ R f dt, z what the DVL read, and A what turns
-(and scales) it into the IMU's axes. Start velocity v_0 and gravity g are any vectors, fitted anew in every window, so
-that neither attitude nor gravity is needed; both biases are fitted, too.
+gravity: R (A z + w × p) = V + v_0 + g t, with R the integrated gyro, V = ∫ R f dt, z what the DVL read, and A what
+turns (and scales) it into the IMU's axes. Start velocity v_0 and gravity g are any vectors, fitted anew in every
+window, so that neither attitude nor gravity is needed; both biases are fitted, too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...datasets.log import Log
+from ...datasets.log import DvlStream, Log
 from ...datasets.state import Array
 from .answers import Answer, Delay
 from .findings import Check, Finding
@@ -118,7 +118,6 @@ class Mounted:
         yaw: of the DVL's axes in L, rad.
         tilt: roll and pitch of them, rad.
         p_BI_B: IMU's place from the DVL, m, by axis of B.
-        mirrored: whether the DVL's y runs the other way.
         left: (n, 3) m/s, residual; t_s (n,).
     """
 
@@ -127,7 +126,6 @@ class Mounted:
     yaw: Estimate
     tilt: tuple[Estimate, Estimate]
     p_BI_B: tuple[Estimate, Estimate, Estimate]
-    mirrored: bool
     t_s: Array
     left: Array
 
@@ -160,7 +158,6 @@ def fit_mounting(log: Log, imu: Inertial) -> Mounted | None:
         yaw=Estimate(float(np.angle(np.exp(1j * guess.yaw))), fit["turn z"].sigma, fit.dof),
         tilt=(fit["turn x"], fit["turn y"]),
         p_BI_B=(forward, left, up),
-        mirrored=_mirrored(moved, t_s, z, window, guess.delay_s),
         t_s=t_s,
         left=fit.residual.reshape(-1, 3),
     )
@@ -285,20 +282,49 @@ def _best_lag(moved: Strapdown, t_s: Array, z: Array, window: Index) -> float | 
     return float(LAGS_S[int(np.argmin(left))]) if np.isfinite(left).all() else None
 
 
-def _mirrored(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> bool:
-    """Whether the horizontal map from the DVL to the IMU turns over: its determinant is negative beyond doubt."""
-    R, V, w = (moved.at(t_s - delay_s, name) for name in ("R", "V", "w"))
+def _signs(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> tuple[bool, bool]:
+    """Whether the map from the DVL to the IMU turns the horizontal over, and whether it turns up to down."""
+    R, V, w, G = (moved.at(t_s - delay_s, name) for name in ("R", "V", "w", "G"))
+    G = G - G[np.searchsorted(window, window)]
     columns = {f"{a}{b}": _turn(R, z[:, [i]] * UNIT[j]) for i, a in enumerate("xy") for j, b in enumerate("xy")}
+    columns["zz"] = _turn(R, z[:, [2]] * UNIT[2])
     columns |= {f"arm {axis}": _turn(R, np.cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
-    every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, 2)
+    columns |= {f"accel {axis}": G[:, :, i] for i, axis in enumerate("xyz")}
+    every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, DEGREE_OF_TREND)
     y = every.pop("V")
     fit = least_squares(every, y, np.repeat(blocks_of_windows(window), 3))
     if fit is None:
-        return False
-    m = {name: fit[name] for name in ("xx", "xy", "yx", "yy")}
-    if not all(part.known_to(0.6) for part in m.values()):
-        return False
-    return m["xx"].value * m["yy"].value - m["xy"].value * m["yx"].value < -0.25
+        return False, False
+    m = {name: fit[name] for name in ("xx", "xy", "yx", "yy", "zz")}
+    flat = all(m[name].known_to(0.5) for name in ("xx", "xy", "yx", "yy"))
+    area = m["xx"].value * m["yy"].value - m["xy"].value * m["yx"].value
+    return flat and area < -0.25, m["zz"].known_to(0.5) and m["zz"].value < -0.5
+
+
+def mirrored_dvl(log: Log, imu: Inertial) -> tuple[Answer, Log] | None:
+    """Return what to say of a DVL whose axes run against the IMU's, and the log with them turned; None if none do."""
+    t_s, z, never = velocities(log)
+    assert log.dvl is not None
+    if len(t_s) < 60 or never:
+        return None
+    window = windows_of(t_s, min(WINDOW_S, (t_s[-1] - t_s[0]) / BLOCKS), 3.0)
+    moved = integrate(imu, np.zeros(3))
+    delay_s = _best_lag(moved, t_s, z, window)
+    flat, vertical = (False, False) if delay_s is None else _signs(moved, t_s, z, window, delay_s)
+    if not (flat or vertical):
+        return None
+    signs = np.array([1.0, -1.0 if flat else 1.0, -1.0 if vertical else 1.0])
+    which = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
+    says = f"The DVL's {which} run{'s' * (which in 'xyz')} against the IMU's"
+    if flat and vertical:
+        says += ": forward-right-down and forward-left-up are taken for one another, in one of the two."
+        fix = "streams.dvl.axes: FRD  # or FLU, whichever it is not"
+    else:
+        says += ": a sign is wrong."
+        fix = "streams.dvl.velocity.scale: [" + ", ".join(f"{sign:g}" for sign in signs) + "]"
+    turned = DvlStream(log.dvl.t_ns, log.dvl.received_ns, log.dvl.z * signs, log.dvl.sigma)
+    check = Check("axes of the DVL against the IMU's", {"turned over": which}, (Finding("dvl", says, fix),))
+    return Answer(check), replace(log, dvl=turned)
 
 
 def _part(fit: Fit, names: list[str]) -> Array:
@@ -336,12 +362,6 @@ def imu_against_dvl(log: Log, imu: Inertial) -> Answer | None:
 
 
 def _findings(log: Log, imu: Inertial, found: Mounted) -> list[Finding]:
-    if found.mirrored:
-        says = (
-            "The DVL's y axis runs against the IMU's while their x axes agree: forward-right-down is read as "
-            "forward-left-up, in one of the two."
-        )
-        return [Finding("dvl", says, "streams.dvl.axes: the other one of FRD and FLU")]
     roll, pitch = (
         tilt.value if tilt.known_to(10 * DEGREE) and tilt.differs(0.0, TURN_MATTERS) else 0.0 for tilt in found.tilt
     )
@@ -362,6 +382,8 @@ def _findings(log: Log, imu: Inertial, found: Mounted) -> list[Finding]:
                 f"B's z, as the IMU is mounted, is not up: the mean specific force points to "
                 f"({imu.up_B[0]:.2f}, {imu.up_B[1]:.2f}, {imu.up_B[2]:.2f})."
             )
+            if imu.up_B[2] < -0.9:
+                says += " Forward-right-down is read as forward-left-up (`streams.imu.axes`), or so it is mounted."
             says += " The yaw is from the DVL." if known else " The yaw cannot be told: the shortest turn is given."
         R_new = (back if known else UNIT) @ imu.R_LB @ R_BI
         return [Finding("imu", says, "streams.imu.mounting: " + mounting_text(R_new, np.asarray(log.rig.imu.p_BS_B)))]

@@ -83,20 +83,24 @@ def truth_against_itself(log: Log) -> Answer | None:
     dt_s = np.diff(t_s)
     moved = np.diff(truth.p_WB_W, axis=0)
     said = (truth.v_WB_W[1:] + truth.v_WB_W[:-1]) / 2 * dt_s[:, None]
-    block = blocks_of(len(dt_s))
+    faster = np.diff(truth.v_WB_W, axis=0)
+    columns = {name: np.outer(dt_s, unit).ravel() for name, unit in zip(AXES, np.eye(3), strict=True)}
+    columns["delay"] = faster.ravel()
+    fit = least_squares(columns, (said - moved).ravel(), np.repeat(blocks_of(len(dt_s)), 3))
+    if fit is None:
+        return None
     facts, findings = {}, []
-    for axis, name in enumerate(AXES):
-        steps = {"drift": dt_s}
-        fit = least_squares(steps, said[:, axis] - moved[:, axis], block)
-        if fit is None:
-            return None
-        facts[f"velocity less what the positions do, {name}"] = fit["drift"].text("m/s")
-        if fit["drift"].differs(0.0, DRIFT_MATTERS_M_S):
+    for name in AXES:
+        facts[f"velocity less what the positions do, {name}"] = fit[name].text("m/s")
+        if fit[name].differs(0.0, DRIFT_MATTERS_M_S):
             says = (
-                f"The {whose}'s velocity {name} is {fit['drift'].text('m/s')} off what its own positions do: do not "
+                f"The {whose}'s velocity {name} is {fit[name].text('m/s')} off what its own positions do: do not "
                 "score velocities against it, or leave `truth.velocity` out."
             )
             findings.append(Finding("truth", says, "truth.velocity: null"))
+    facts["positions later than velocities by"] = fit["delay"].text_if(0.5, "s")
+    known = fit["delay"].known_to(0.5)
+    delays = (Delay("truth position", "truth velocity", fit["delay"]),) if known else ()
 
     def draw(axes: Axes) -> None:
         off = np.cumsum(said - moved, axis=0)
@@ -105,7 +109,7 @@ def truth_against_itself(log: Log) -> Answer | None:
         axes.legend(fontsize=7)
         axes.set(xlabel="time (min)", ylabel="∫ velocity less position (m)", title=f"{whose} against itself")
 
-    return Answer(Check(f"{whose} against itself", facts, tuple(findings), draw))
+    return Answer(Check(f"{whose} against itself", facts, tuple(findings), draw), delays)
 
 
 def gps_against_truth(log: Log) -> Answer | None:
@@ -119,7 +123,13 @@ def gps_against_truth(log: Log) -> Answer | None:
         return None
     t_s, z, sigma = t_s[inside], log.gps.z[inside], log.gps.sigma[inside]
     R = np.nan_to_num(reference.at(t_s, reference.R_WB))
-    error = z - reference.at(t_s, reference.p_W) - R @ np.asarray(log.rig.gps.p_BS_B)
+    place = reference.at(t_s, reference.p_W) + R @ np.asarray(log.rig.gps.p_BS_B)
+    error = z - place
+    swapped = z[:, [1, 0]] - place[:, :2]
+    if np.median(np.abs(swapped)) < 0.2 * np.median(np.abs(error[:, :2])):
+        says = f"GPS lies on the {log.truth_kind} only with east and north exchanged: one of the two is read as NED."
+        finding = Finding("gps", says, "streams.gps.frame: NED  # or ENU, whichever it is not")
+        return Answer(Check(f"GPS against {log.truth_kind}", {"lies": "exchanged, east for north"}, (finding,)))
     v = reference.at(t_s, reference.v_W)
     block = blocks_of(len(t_s))
     whose = log.truth_kind
@@ -190,7 +200,10 @@ def depth_against_truth(log: Log) -> Answer | None:
         delays = (Delay("depth", "truth position", fit["delay"]),) if fit["delay"].known_to(0.5) else ()
         if scale.differs(1.0, 0.01):
             says = f"The depth sensor reads {scale.text()} of the {whose}'s changes in height: unit, sign or density."
-            findings.append(Finding("depth", says, f"streams.depth.depth.scale: {1 / scale.value:.4g}"))
+            turned = abs(scale.value + 1) < 0.05
+            mend = f"streams.depth.depth.scale: {1 / scale.value:.4g}"
+            mend = "streams.depth.positive: up  # or down, whichever it is not" if turned else mend
+            findings.append(Finding("depth", says, mend))
     if offset.differs(0.0, DEPTH_OFFSET_MATTERS_M) and not findings:
         shift = offset.value
         if log.truth_kind == "reference" or abs(shift) > 5.0:
@@ -214,7 +227,7 @@ def dvl_against_truth(log: Log, imu: Inertial) -> Answer | None:
     reference = reference_of(log)
     if reference is None or log.dvl is None or not np.isfinite(reference.R_WB).any():
         return None
-    t_s, z, never = velocities(log)
+    t_s, z, _ = velocities(log)
     inside = reference.covers(t_s)
     R = reference.at(t_s, reference.R_WB)
     inside &= np.isfinite(R).all(axis=(1, 2))

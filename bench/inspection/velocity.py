@@ -22,7 +22,6 @@ from .fitting import (
     blocks_of_windows,
     least_squares,
     stacked,
-    windows_of,
     without_trend,
 )
 from .inertial import Inertial, seconds, yaw_by_heading
@@ -35,6 +34,8 @@ SCALE_MATTERS = 0.01
 TURN_MATTERS = 1.0 * DEGREE
 POSITION_PERIOD_S = 0.5
 GAP_S = 5.0
+ARM_DOUBT_M = 0.3
+"""No lever arm is trusted beyond this, and at a steady speed one looks like a delay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,12 +181,12 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
     mirrored = over is not None and straight is not None and over.rms < 0.3 * straight.rms
     grown = complex(z[0] * np.exp(best["scale"].value + 1j * best["turn"].value))
     x = without_trend(path(t_s - delay_s, dvl_s, bias), t_s, window, 0)
-    dof = best.dof
+    dof, speed = best.dof, float(np.sqrt(np.mean(np.abs(v) ** 2)))
     return PathFit(
         scale=Estimate(abs(grown), best["scale"].sigma * abs(grown), dof),
         turn=Estimate(float(np.angle(grown)), best["turn"].sigma, dof),
         dvl_delay=Estimate(dvl_s, best["dvl"].sigma, dof),
-        delay=Estimate(delay_s, best["delay"].sigma, dof),
+        delay=Estimate(delay_s, float(np.hypot(best["delay"].sigma, ARM_DOUBT_M / max(speed, 1e-3))), dof),
         bias=Estimate(bias, best["bias"].sigma, dof) if by == "gyro" else None,
         rms_m=best.rms,
         mirrored=mirrored,
@@ -220,7 +221,8 @@ def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> Answer |
             "turns the wrong way (a compass read as a yaw)."
         )
         part = "streams.gps" if whose == "GPS" else "truth"
-        findings.append(Finding("heading", says, f"streams.heading.convention, or {part}.frame: the other one"))
+        says += f" Or `{part}.frame` is wrong."
+        findings.append(Finding("heading", says, "streams.heading.convention: yaw  # or compass, whichever it is not"))
     elif moved:
         facts[f"turn of the DVL's path onto the {whose}'s"] = (
             found.turn.times(1 / DEGREE).text("°") if by == "heading" else "free: no heading sensor"
