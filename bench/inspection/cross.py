@@ -8,7 +8,7 @@ from .clock import clock_check
 from .findings import Check
 from .headings import gyro_against_heading, heading_against_truth
 from .inertial import inertial_of
-from .lever_arm import imu_against_dvl, mirrored_dvl
+from .lever_arm import imu_against_dvl, mirrored_dvl, up_check
 from .references import depth_against_truth, dvl_against_truth, gps_against_truth, truth_against_itself
 from .velocity import dvl_against_positions, positions
 
@@ -22,6 +22,8 @@ def cross_checks(log: Log) -> list[Check]:
     """
     imu = inertial_of(log)
     answers: list[Answer | None] = []
+    if log.dvl is None:
+        answers.append(Answer(up_check(log, imu)))
     if log.heading is not None:
         answers += [gyro_against_heading(log, imu), heading_against_truth(log)]
     if log.dvl is not None:

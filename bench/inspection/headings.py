@@ -39,6 +39,7 @@ SLOW_MATTERS = 0.5 * DEGREE
 OVERCONFIDENT = 2.0
 """A sigma that claims the errors to be so many times smaller than they are, is a finding."""
 MOST_ROWS = 20_000
+GRID_ROWS = 3_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +96,10 @@ def _turns(
     t_s: Array, psi: Array, imu: Inertial, theta: Array, window_s: float, degree: int, delay_s: float | None
 ) -> tuple[Fit, float] | None:
     """Return the fit of the heading by the turned gyro, and the delay (s), from a coarse grid where none is given."""
+    if delay_s is None and len(t_s) > 2 * GRID_ROWS:
+        stride = len(t_s) // GRID_ROWS
+        coarse = _turns(t_s[::stride], psi[::stride], imu, theta, window_s, degree, None)
+        delay_s = None if coarse is None else coarse[1]
     window = windows_of(t_s, window_s, 5.0)
     block = blocks_of_windows(window)
     y = without_trend(psi, t_s, window, degree)
@@ -340,14 +345,19 @@ def _spread_by_time(log: Log, found: GyroHeading) -> Spread | None:
             shown.append((lag_s, float(square[good].mean())))
     if len(shown) < 2:
         return None
-    white, (_, top) = shown[0][1], max(shown, key=lambda pair: pair[1])
+    near, _, _ = halves(int(steps[0]))
+    growths: list[tuple[Estimate, float, float]] = []
+    for step in steps[1:]:
+        far, good, lag_s = halves(int(step))
+        growth = mean_of((far - near[: len(far)])[good], block[: len(far)][good]) if good.sum() > 30 else None
+        if growth is not None:
+            growths.append((growth, lag_s, float(far[good].mean())))
+    if not growths:
+        return None
+    white = shown[0][1]
+    growth, _, top = max(growths, key=lambda each: each[0].value - each[0].reach)  # where it is surest
     slow = max(top - white, 0.0)
     correlation_s = next(lag for lag, value in shown if value - white >= 0.63 * slow)
-    first, last = int(steps[0]), round(max(shown, key=lambda pair: pair[1])[0] / period_s)
-    (near, _, _), (far, good, _) = halves(first), halves(last)
-    growth = mean_of((far - near[: len(far)])[good], block[: len(far)][good])
-    if growth is None:
-        return None
     return Spread(shown[:: max(len(shown) // 6, 1)], max(white, 0.0), slow, correlation_s, growth)
 
 

@@ -17,6 +17,9 @@ which a vertical rate feels in second order only."""
 UPSIDE_DOWN = np.radians(30.0)
 """A mean up that leans further than this from B's z is a wrong mounting, no trim."""
 
+ALONG_AN_AXIS = np.radians(15.0)
+"""What a vehicle's trim may be: a mean up that is nearer to an axis of B is taken for that axis."""
+
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
@@ -27,8 +30,9 @@ class Inertial:
         dt_s: (n,) their lengths.
         w_L, f_L: (n, 3) rad/s and m/s².
         up_L: (n, 3) unit vector.
-        R_LB: (3, 3) the shortest turn that brings the mean up onto z, where that is needed.
+        R_LB: (3, 3) the shortest turn that brings the axis that is up onto z, where that is needed.
         up_B: (3,) the mean up as the description has it.
+        flipped: whether all is well once the IMU's axes are taken for forward-right-down instead of forward-left-up.
     """
 
     t_s: Array
@@ -38,6 +42,7 @@ class Inertial:
     up_L: Array
     R_LB: Array
     up_B: Array
+    flipped: bool
 
     @property
     def period_s(self) -> float:
@@ -75,8 +80,12 @@ def inertial_of(log: Log) -> Inertial:
     up_each /= np.maximum(np.linalg.norm(up_each, axis=1, keepdims=True), 1e-9)
     up_B = up_each.mean(axis=0)
     up_B /= max(float(np.linalg.norm(up_B)), 1e-9)
-    R_LB = np.eye(3) if up_B[2] > np.cos(UPSIDE_DOWN) else _onto_z(up_B)
-    return Inertial(t_s, dt_s, w_B @ R_LB.T, f_B @ R_LB.T, up_each @ R_LB.T, R_LB, up_B)
+    R_LB, flipped = np.eye(3), False
+    if up_B[2] < np.cos(UPSIDE_DOWN):
+        other_axes = R_BI @ np.diag([1.0, -1.0, -1.0]) @ R_BI.T
+        flipped = bool(other_axes[2] @ up_B > np.cos(ALONG_AN_AXIS))
+        R_LB = other_axes if flipped else _onto_z(_nearest_axis(up_B))
+    return Inertial(t_s, dt_s, w_B @ R_LB.T, f_B @ R_LB.T, up_each @ R_LB.T, R_LB, up_B, flipped)
 
 
 def seconds(log: Log, t_ns: TimeArray) -> Array:
@@ -97,6 +106,13 @@ def yaw_by_heading(log: Log, imu: Inertial) -> tuple[Array, Array]:
     t_s, psi = headings(log)
     h = np.einsum("nij,j->ni", imu.level(t_s), np.asarray(log.rig.heading.R_BS)[:, 0])
     return t_s, psi - np.unwrap(np.arctan2(h[:, 1], h[:, 0]))
+
+
+def _nearest_axis(up: Array) -> Array:
+    """Return the axis that `up` runs along, as sensors are mounted, or `up` itself where it is far from any."""
+    best = int(np.argmax(np.abs(up)))
+    axis = np.sign(up[best]) * np.eye(3)[best]
+    return axis if axis @ up > np.cos(ALONG_AN_AXIS) else up
 
 
 def _onto_z(up: Array) -> Array:

@@ -42,7 +42,7 @@ DEGREE_OF_TREND = 2
 LAGS_S = np.arange(-2.0, 2.01, 0.25)
 ARM_MATTERS_M = 0.1
 TURN_MATTERS = 2.0 * DEGREE
-FASTEST_HZ = 60.0
+FASTEST_HZ = 25.0
 """Samples are added up to about this rate first: nothing that a DVL sees is faster."""
 UNIT = np.eye(3)
 
@@ -70,9 +70,10 @@ class Strapdown:
     def at(self, t_s: Array, name: str) -> Array:
         """Interpolate one of the arrays."""
         values: Array = getattr(self, name)
-        flat = values.reshape(len(values), -1)
-        found = np.stack([np.interp(t_s, self.t_s, column) for column in flat.T], axis=1)
-        return found.reshape(len(t_s), *values.shape[1:])
+        after = np.searchsorted(self.t_s, t_s).clip(1, len(self.t_s) - 1)
+        share = (t_s - self.t_s[after - 1]) / (self.t_s[after] - self.t_s[after - 1])
+        share = share.clip(0.0, 1.0).reshape(-1, *(1,) * (values.ndim - 1))
+        return values[after - 1] * (1 - share) + values[after] * share
 
 
 def integrate(imu: Inertial, bias: Array) -> Strapdown:
@@ -337,7 +338,8 @@ def imu_against_dvl(log: Log, imu: Inertial) -> Answer | None:
     found = fit_mounting(log, imu)
     if found is None:
         says = "not observable: the IMU's noise over a window outweighs what the vehicle's velocity changes"
-        return Answer(Check("IMU against DVL", {"delay, mounting, lever arm": says}))
+        check = up_check(log, imu)
+        return Answer(Check("IMU against DVL", {"delay, mounting, lever arm": says, **check.facts}, check.findings))
     facts = {"DVL later than the IMU by": found.delay.text_if(0.5, "s")}
     facts["DVL's axes in the IMU's as mounted, yaw"] = found.yaw.times(1 / DEGREE).text_if(15, "°")
     for name, tilt in zip(("roll", "pitch"), found.tilt, strict=True):
@@ -361,32 +363,44 @@ def imu_against_dvl(log: Log, imu: Inertial) -> Answer | None:
     return Answer(Check("IMU against DVL", facts, tuple(findings), draw), delays)
 
 
+def up_check(log: Log, imu: Inertial) -> Check:
+    """Whether the accelerometers, as they are mounted, say that B's z is up: what can be told without a DVL."""
+    lean = np.degrees(np.arccos(np.clip(imu.up_B[2], -1, 1)))
+    facts = {"mean up in B": "({:.2f}, {:.2f}, {:.2f})".format(*imu.up_B), "leans from z by": f"{lean:.1f} °"}
+    findings = () if np.allclose(imu.R_LB, UNIT) else (_mounting_finding(log, imu, _not_up(imu), UNIT),)
+    return Check("which way is up", facts, findings)
+
+
+def _not_up(imu: Inertial) -> str:
+    up = "({:.2f}, {:.2f}, {:.2f})".format(*imu.up_B)
+    says = f"B's z, as the IMU is mounted, is not up: the mean specific force points to {up}."
+    return says + " Forward-right-down is read as forward-left-up, or the reverse." * imu.flipped
+
+
+def _mounting_finding(log: Log, imu: Inertial, says: str, back: Array) -> Finding:
+    """Return what mounts the IMU so that up is up, turned `back` besides."""
+    if imu.flipped and np.allclose(back, UNIT):
+        return Finding("imu", says, "streams.imu.axes: FRD  # or FLU, whichever it is not")
+    R_BI = back @ imu.R_LB @ np.asarray(log.rig.imu.R_BS)
+    return Finding("imu", says, "streams.imu.mounting: " + mounting_text(R_BI, np.asarray(log.rig.imu.p_BS_B)))
+
+
 def _findings(log: Log, imu: Inertial, found: Mounted) -> list[Finding]:
     roll, pitch = (
         tilt.value if tilt.known_to(10 * DEGREE) and tilt.differs(0.0, TURN_MATTERS) else 0.0 for tilt in found.tilt
     )
-    tilted = Rotation.from_rotvec([-roll, -pitch, 0.0]).as_matrix()
-    back = Rotation.from_euler("z", -found.yaw.value).as_matrix() @ tilted
-    R_BI = np.asarray(log.rig.imu.R_BS)
-    wrong_level = not np.allclose(imu.R_LB, UNIT)
     turned = found.yaw.known_to(15 * DEGREE) and found.yaw.differs(0.0, TURN_MATTERS)
-    if wrong_level or turned or roll or pitch:
-        known = found.yaw.known_to(15 * DEGREE)
+    tilted = Rotation.from_rotvec([-roll, -pitch, 0.0]).as_matrix()
+    back = (Rotation.from_euler("z", -found.yaw.value).as_matrix() if turned else UNIT) @ tilted
+    if not np.allclose(imu.R_LB, UNIT):
+        return [_mounting_finding(log, imu, _not_up(imu) + " What turn is left is from the DVL.", back)]
+    if turned or roll or pitch:
+        yaw, *tilts = (e.times(1 / DEGREE).text("°") for e in (found.yaw, *found.tilt))
         says = (
-            f"The DVL's axes are turned by {found.yaw.times(1 / DEGREE).text('°')} in yaw, "
-            f"{found.tilt[0].times(1 / DEGREE).text('°')} in roll and {found.tilt[1].times(1 / DEGREE).text('°')} in "
-            "pitch from the IMU's as mounted. A heading sensor in the IMU's housing is turned alike."
+            f"The DVL's axes are turned by {yaw} in yaw, {tilts[0]} in roll and {tilts[1]} in pitch from the IMU's as "
+            "mounted. A heading sensor in the IMU's housing is turned alike."
         )
-        if wrong_level:
-            says = (
-                f"B's z, as the IMU is mounted, is not up: the mean specific force points to "
-                f"({imu.up_B[0]:.2f}, {imu.up_B[1]:.2f}, {imu.up_B[2]:.2f})."
-            )
-            if imu.up_B[2] < -0.9:
-                says += " Forward-right-down is read as forward-left-up (`streams.imu.axes`), or so it is mounted."
-            says += " The yaw is from the DVL." if known else " The yaw cannot be told: the shortest turn is given."
-        R_new = (back if known else UNIT) @ imu.R_LB @ R_BI
-        return [Finding("imu", says, "streams.imu.mounting: " + mounting_text(R_new, np.asarray(log.rig.imu.p_BS_B)))]
+        return [_mounting_finding(log, imu, says, back)]
     stated = np.asarray(log.rig.imu.p_BS_B)
     wrong = [
         i for i, arm in enumerate(found.p_BI_B) if arm.known_to(0.5) and arm.differs(float(stated[i]), ARM_MATTERS_M)
