@@ -7,8 +7,8 @@ Source: Cameron & Miller 2015, A practitioner's guide to cluster-robust inferenc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ FALSE_ALARM = 1e-3
 """How often one estimate may seem to differ by chance."""
 FEWEST_BLOCKS = 4
 Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+Plane = NDArray[np.complexfloating[Any, Any]]
+"""Vectors in the horizontal plane: east + i north, or forward + i left."""
+Values = TypeVar("Values", Array, Plane)
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class Fit:
     cov: Array
     dof: int
     residual: Array
-    kept: NDArray[np.bool_]
+    kept: Mask
 
     def __getitem__(self, name: str) -> Estimate:
         k = self.names.index(name)
@@ -164,7 +168,7 @@ def blocks_of_windows(window: Index) -> Index:
     return blocks_of(len(window))[first][window]
 
 
-def without_trend(values: Array, t_s: Array, window: Index, degree: int) -> Array:
+def without_trend(values: Values, t_s: Array, window: Index, degree: int) -> Values:
     """Return values (n, …) less the best polynomial of time in each window; a window with too few rows gives zeros."""
     out = np.zeros_like(values)
     edges = np.flatnonzero(np.diff(window)) + 1
@@ -178,7 +182,6 @@ def without_trend(values: Array, t_s: Array, window: Index, degree: int) -> Arra
     return out
 
 
-def stacked(columns: Sequence[Array]) -> Array:
-    """Return the real and the imaginary part of complex columns (n,), one under the other: (2 n, k)."""
-    z = np.stack(columns, axis=1)
-    return np.concatenate([z.real, z.imag])
+def stacked(z: Plane) -> Array:
+    """Return the real parts (n,) and under them the imaginary ones: (2 n,)."""
+    return np.asarray(np.concatenate([z.real, z.imag]), dtype=np.float64)

@@ -15,6 +15,8 @@ from .fitting import (
     BLOCKS,
     Estimate,
     Fit,
+    Index,
+    Mask,
     blocks_of,
     blocks_of_windows,
     least_squares,
@@ -61,7 +63,7 @@ class GyroHeading:
     bias: Estimate
     delay: Estimate
     left: Array
-    kept: Array
+    kept: Mask
 
 
 def fit_gyro_to_heading(log: Log, imu: Inertial) -> GyroHeading | None:
@@ -332,7 +334,7 @@ def _spread_by_time(log: Log, found: GyroHeading) -> Spread | None:
     block = blocks_of(len(t_s))
     density = log.rig.imu_noise.gyro_density
 
-    def halves(step: int) -> tuple[Array, Array, float]:
+    def halves(step: int) -> tuple[Array, Mask, float]:
         apart = t_s[step:] - t_s[:-step]
         good = np.abs(apart - step * period_s) < 0.3 * step * period_s
         square = 0.5 * (left[step:] - left[:-step]) ** 2 - 0.5 * density**2 * apart
@@ -420,13 +422,13 @@ def heading_against_truth(log: Log) -> Answer | None:
     return Answer(Check(f"heading against {whose}", facts, tuple(findings), draw), delays)
 
 
-def _deviation(true: Array, left: Array, block: Array) -> dict[str, str]:
+def _deviation(true: Array, left: Array, block: Index) -> dict[str, str]:
     """Return the compass deviation's amplitudes once and twice around, where the vehicle went all around."""
     sectors = np.unique(np.floor((true % (2 * np.pi)) / (np.pi / 4)))
     if len(sectors) < 8:
         return {}
     waves = {f"{name}{k}": f(k * true) for k in (1, 2) for name, f in (("sin", np.sin), ("cos", np.cos))}
-    fit = least_squares({"mean": np.ones(len(true)), **waves}, left, block.astype(np.intp))
+    fit = least_squares({"mean": np.ones(len(true)), **waves}, left, block)
     if fit is None:
         return {}
     said = {}

@@ -57,7 +57,7 @@ class Inertial:
         h = np.array([1.0, 0.0, 0.0]) if h_L is None else h_L
         tilt = self.up_L @ h
         rate = (np.einsum("ni,ni->n", self.up_L, self.w_L) - tilt * (self.w_L @ h)) / np.maximum(1 - tilt**2, 0.1)
-        return np.cumsum(rate * self.dt_s)
+        return np.cumsum(rate * self.dt_s, dtype=np.float64)
 
     def level(self, t_s: Array) -> Array:
         """Return R (k, 3, 3) from L to the level frame of yaw zero, at t_s (k,)."""
@@ -90,7 +90,12 @@ def inertial_of(log: Log) -> Inertial:
 
 def seconds(log: Log, t_ns: TimeArray) -> Array:
     """Return times from the log's start, s."""
-    return (t_ns - log.start_ns) * 1e-9
+    return np.asarray((t_ns - log.start_ns) * 1e-9, dtype=np.float64)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a × b, of (n, 3) or (3,) each."""
+    return np.asarray(np.cross(a, b), dtype=np.float64)
 
 
 def headings(log: Log) -> tuple[Array, Array]:

@@ -29,7 +29,7 @@ from .fitting import (
     without_trend,
 )
 from .headings import mounting_text
-from .inertial import Inertial
+from .inertial import Inertial, cross
 from .velocity import velocities
 
 if TYPE_CHECKING:
@@ -231,22 +231,22 @@ def _fit(moved: Strapdown, t_s: Array, z: Array, window: Index, guess: _Guess) -
     first = np.searchsorted(window, window)
     z_L = guess.scale * z @ Rotation.from_euler("z", guess.yaw).as_matrix().T
     V = V - V[first]
-    moving = _turn(R, z_L + np.cross(w, guess.arm))
+    moving = _turn(R, z_L + cross(w, guess.arm))
     left = without_trend(moving - V, t_s, window, DEGREE_OF_TREND)
     v_W = _turn(R, z_L) - left
     v_L = np.einsum("nji,nj->ni", R, v_W)
 
     def shifted(shift: float) -> Array:
         R, w = moved.at(at_s + shift, "R"), moved.at(at_s + shift, "w")
-        return _turn(R, v_L + np.cross(w, guess.arm)) - moved.at(at_s + shift, "V")
+        return _turn(R, v_L + cross(w, guess.arm)) - moved.at(at_s + shift, "V")
 
     columns = {"scale": v_W, "delay": (shifted(-step_s) - shifted(step_s)) / (2 * step_s)}
-    columns |= {f"turn {axis}": _turn(R, np.cross(UNIT[i], v_L)) for i, axis in enumerate("xyz")}
-    columns |= {f"arm {axis}": _turn(R, np.cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
+    columns |= {f"turn {axis}": _turn(R, cross(UNIT[i], v_L)) for i, axis in enumerate("xyz")}
+    columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
     for i, axis in enumerate("xyz"):
         since = G[:, :, i] - G[first, :, i]
         columns[f"accel {axis}"] = since
-        columns[f"bias {axis}"] = J[:, :, i] - np.cross(G[first, :, i], V) - np.cross(since, v_W)
+        columns[f"bias {axis}"] = J[:, :, i] - cross(G[first, :, i], V) - cross(since, v_W)
     every = _in_windows(columns, t_s, window, DEGREE_OF_TREND)
     return least_squares(every, -left.ravel(), np.repeat(blocks_of_windows(window), 3))
 
@@ -254,8 +254,8 @@ def _fit(moved: Strapdown, t_s: Array, z: Array, window: Index, guess: _Guess) -
 def _first_yaw(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> float:
     """Return the DVL's yaw in L from a fit without a guess; zero where that does not tell."""
     R, V, w = (moved.at(t_s - delay_s, name) for name in ("R", "V", "w"))
-    columns = {"along": _turn(R, z), "across": _turn(R, np.cross(UNIT[2], z))}
-    columns |= {f"arm {axis}": _turn(R, np.cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
+    columns = {"along": _turn(R, z), "across": _turn(R, cross(UNIT[2], z))}
+    columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
     every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, 2)
     y = every.pop("V")
     fit = least_squares(every, y, np.repeat(blocks_of_windows(window), 3))
@@ -273,8 +273,8 @@ def _best_lag(moved: Strapdown, t_s: Array, z: Array, window: Index) -> float | 
     left = []
     for lag in LAGS_S:
         R, V, w = (moved.at(t_s - lag, name) for name in ("R", "V", "w"))
-        columns = {"along": _turn(R, z), "across": _turn(R, np.cross(UNIT[2], z))}
-        columns |= {f"arm {axis}": _turn(R, np.cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
+        columns = {"along": _turn(R, z), "across": _turn(R, cross(UNIT[2], z))}
+        columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
         every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, 2)
         y = every.pop("V")
         X = np.stack(list(every.values()), axis=1)
@@ -289,7 +289,7 @@ def _signs(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float
     G = G - G[np.searchsorted(window, window)]
     columns = {f"{a}{b}": _turn(R, z[:, [i]] * UNIT[j]) for i, a in enumerate("xy") for j, b in enumerate("xy")}
     columns["zz"] = _turn(R, z[:, [2]] * UNIT[2])
-    columns |= {f"arm {axis}": _turn(R, np.cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
+    columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
     columns |= {f"accel {axis}": G[:, :, i] for i, axis in enumerate("xyz")}
     every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, DEGREE_OF_TREND)
     y = every.pop("V")
@@ -349,7 +349,10 @@ def imu_against_dvl(log: Log, imu: Inertial) -> Answer | None:
     facts["IMU's place from the DVL"] = f"forward {said[0]}, left {said[1]}, up {said[2]}"
     stated = np.asarray(log.rig.imu.p_BS_B)
     facts["as stated"] = f"forward {stated[0]:.2f} m, left {stated[1]:.2f} m, up {stated[2]:.2f} m"
-    findings = _findings(log, imu, found)
+    never = velocities(log)[2]
+    if never:
+        facts["taken for zero, as not measured"] = f"velocity along {' and '.join(never)}; no lever arm is concluded"
+    findings = _findings(log, imu, found, bool(never))
 
     def draw(axes: Axes) -> None:
         for i, axis in enumerate(("forward", "left", "up")):
@@ -385,9 +388,10 @@ def _mounting_finding(log: Log, imu: Inertial, says: str, back: Array) -> Findin
     return Finding("imu", says, "streams.imu.mounting: " + mounting_text(R_BI, np.asarray(log.rig.imu.p_BS_B)))
 
 
-def _findings(log: Log, imu: Inertial, found: Mounted) -> list[Finding]:
+def _findings(log: Log, imu: Inertial, found: Mounted, incomplete: bool) -> list[Finding]:
     roll, pitch = (
-        tilt.value if tilt.known_to(10 * DEGREE) and tilt.differs(0.0, TURN_MATTERS) else 0.0 for tilt in found.tilt
+        tilt.value if not incomplete and tilt.known_to(10 * DEGREE) and tilt.differs(0.0, TURN_MATTERS) else 0.0
+        for tilt in found.tilt
     )
     turned = found.yaw.known_to(15 * DEGREE) and found.yaw.differs(0.0, TURN_MATTERS)
     tilted = Rotation.from_rotvec([-roll, -pitch, 0.0]).as_matrix()
@@ -405,7 +409,7 @@ def _findings(log: Log, imu: Inertial, found: Mounted) -> list[Finding]:
     wrong = [
         i for i, arm in enumerate(found.p_BI_B) if arm.known_to(0.5) and arm.differs(float(stated[i]), ARM_MATTERS_M)
     ]
-    if not wrong:
+    if incomplete or not wrong:
         return []
     place = stated.copy()
     for i, arm in enumerate(found.p_BI_B):

@@ -13,8 +13,8 @@ from ...datasets.log import Log
 from ...datasets.state import Array
 from .answers import Answer, Delay
 from .findings import Check, Finding
-from .fitting import Estimate, Fit, blocks_of, least_squares, mean_of
-from .inertial import Inertial, seconds
+from .fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
+from .inertial import Inertial, cross, seconds
 from .velocity import SCALE_MATTERS, velocities
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Reference:
         found = np.stack([np.interp(t_s, self.t_s, column) for column in flat.T], axis=1)
         return found.reshape(len(t_s), *values.shape[1:])
 
-    def covers(self, t_s: Array) -> Array:
+    def covers(self, t_s: Array) -> Mask:
         """Return which times (n,) lie a second inside, within a second of a row."""
         near = np.searchsorted(self.t_s, t_s).clip(1, len(self.t_s) - 1)
         gap = self.t_s[near] - self.t_s[near - 1]
@@ -291,7 +291,7 @@ def dvl_against_truth(log: Log, imu: Inertial) -> Answer | None:
 
 
 def _fit_velocity(
-    t_s: Array, z: Array, known: Array, v_at: Callable[[float], Array], imu: Inertial
+    t_s: Array, z: Array, known: Mask, v_at: Callable[[float], Array], imu: Inertial
 ) -> tuple[Fit, Estimate, Estimate, Array, Array] | None:
     """Fit z(t) = scale · R_DB (v_B + w × p)(t − delay) to the measured axes.
 
@@ -304,15 +304,15 @@ def _fit_velocity(
 
     def said(shift: float) -> tuple[Array, Array]:
         w_B = np.stack([np.interp(t_s - shift, imu.t_s, imu.w_L[:, i]) for i in range(3)], axis=1)
-        return scale * (v_at(-shift) + np.cross(w_B, p_BD_B)) @ R_BD, w_B
+        return scale * (v_at(-shift) + cross(w_B, p_BD_B)) @ R_BD, w_B
 
     for _ in range(6):
         here, w_B = said(delay_s)
         unit = np.eye(3)
         columns = {"scale": here / scale}
         columns["delay"] = (said(delay_s + step_s)[0] - said(delay_s - step_s)[0]) / (2 * step_s)
-        columns |= {f"turn {a}": -np.cross(unit[i], here) for i, a in enumerate("xyz")}
-        columns |= {f"arm {a}": scale * np.cross(w_B, unit[i]) @ R_BD for i, a in enumerate("xyz")}
+        columns |= {f"turn {a}": -cross(unit[i], here) for i, a in enumerate("xyz")}
+        columns |= {f"arm {a}": scale * cross(w_B, unit[i]) @ R_BD for i, a in enumerate("xyz")}
         columns = {name: c.ravel()[rows] for name, c in columns.items()}
         columns = {name: c for name, c in columns.items() if np.any(np.abs(c) > 1e-9)}
         fit = least_squares(columns, (z - here).ravel()[rows], block[rows])

@@ -19,6 +19,9 @@ from .fitting import (
     BLOCKS,
     Estimate,
     Fit,
+    Index,
+    Mask,
+    Plane,
     blocks_of_windows,
     least_squares,
     stacked,
@@ -43,7 +46,7 @@ class Positions:
     """Horizontal positions of B: when (n,) s, east + i north (n,) m, whose, and how well they are known, m."""
 
     t_s: Array
-    p: Array
+    p: Plane
     whose: str
     sigma_m: float
 
@@ -70,15 +73,15 @@ class PathFit:
     rms_m: float
     mirrored: bool
     t_s: Array
-    x: Array
-    p: Array
+    x: Plane
+    p: Plane
 
 
 def velocities(log: Log) -> tuple[Array, Array, list[str]]:
     """Return when (n,) s and v_WB_B (n, 3) m/s, unmeasured axes as zero, and the names of those."""
     assert log.dvl is not None
-    known = np.isfinite(log.dvl.sigma)
-    never = [axis for axis, seen in zip("xyz", known.any(axis=0), strict=True) if not seen]
+    known: Mask = np.isfinite(log.dvl.sigma)
+    never = [axis for i, axis in enumerate("xyz") if not known[:, i].any()]
     return seconds(log, log.dvl.t_ns), np.where(known, log.dvl.z, 0.0), never
 
 
@@ -125,14 +128,14 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
     v = v_level[:, 0] + 1j * v_level[:, 1]
     dt_s = np.diff(t_dvl, prepend=t_dvl[0])
 
-    def path(t_s: Array, dvl_delay_s: float, bias: float, mirror: bool = False) -> Array:
+    def path(t_s: Array, dvl_delay_s: float, bias: float, mirror: bool = False) -> Plane:
         t_true = t_dvl - dvl_delay_s
         psi = np.interp(t_true, t_yaw, yaw) - bias * t_true
         each = v * np.exp(1j * psi)
         if mirror:
             each = each.conj()
-        x = np.cumsum((each + np.concatenate([each[:1], each[:-1]])) / 2 * dt_s)
-        return np.interp(t_s, t_true, x)
+        x: Plane = np.cumsum((each + np.concatenate([each[:1], each[:-1]])) / 2 * dt_s)
+        return np.interp(t_s, t_true, x.real) + 1j * np.interp(t_s, t_true, x.imag)
 
     inside = (where.t_s > max(t_dvl[0], t_yaw[0]) + 3) & (where.t_s < min(t_dvl[-1], t_yaw[-1]) - 3)
     inside &= np.abs(t_dvl[np.searchsorted(t_dvl, where.t_s).clip(0, len(t_dvl) - 1)] - where.t_s) < GAP_S
@@ -143,22 +146,22 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
     block = blocks_of_windows(window)
     p = without_trend(p, t_s, window, 0)
 
-    def fit(dvl_delay_s: float, delay_s: float, bias: float, mirror: bool = False) -> tuple[Fit | None, Array]:
-        def x_at(shift: float = 0.0, dvl: float = 0.0, rate: float = 0.0) -> Array:
+    def fit(dvl_delay_s: float, delay_s: float, bias: float, mirror: bool = False) -> tuple[Fit | None, complex]:
+        def x_at(shift: float = 0.0, dvl: float = 0.0, rate: float = 0.0) -> Plane:
             x = path(t_s - delay_s - shift, dvl_delay_s + dvl, bias + rate, mirror)
             return without_trend(x, t_s, window, 0)
 
         x = x_at()
         z = complex(np.vdot(x, p) / max(np.vdot(x, x).real, 1e-12))
-        columns: dict[str, Array] = {"scale": z * x, "turn": 1j * z * x}
+        columns: dict[str, Plane] = {"scale": z * x, "turn": 1j * z * x}
         columns["delay"] = z * (x_at(shift=0.1) - x_at(shift=-0.1)) / 0.2
         columns["dvl"] = z * (x_at(dvl=0.1) - x_at(dvl=-0.1)) / 0.2
         if by == "gyro":
             columns["bias"] = z * (x_at(rate=1e-5) - x_at(rate=-1e-5)) / 2e-5
         left = p - z * x
         rows = np.concatenate([block, block])
-        both = {name: stacked([column])[:, 0] for name, column in columns.items()}
-        return least_squares(both, stacked([left])[:, 0], rows), z * np.array([1.0 + 0j, 0])[:1]
+        both = {name: stacked(column) for name, column in columns.items()}
+        return least_squares(both, stacked(left), rows), z
 
     dvl_s, delay_s, bias = 0.0, 0.0, 0.0
     best, z = fit(dvl_s, delay_s, bias)
@@ -179,7 +182,7 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
     over, _ = fit(0.0, 0.0, 0.0, True) if by == "heading" else (None, z)
     straight, _ = fit(0.0, 0.0, 0.0)
     mirrored = over is not None and straight is not None and over.rms < 0.3 * straight.rms
-    grown = complex(z[0] * np.exp(best["scale"].value + 1j * best["turn"].value))
+    grown = complex(z * np.exp(best["scale"].value + 1j * best["turn"].value))
     x = without_trend(path(t_s - delay_s, dvl_s, bias), t_s, window, 0)
     dof, speed = best.dof, float(np.sqrt(np.mean(np.abs(v) ** 2)))
     return PathFit(
@@ -196,12 +199,12 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
     )
 
 
-def _stretches(t_s: Array, t_dvl: Array) -> Array:
+def _stretches(t_s: Array, t_dvl: Array) -> Index:
     """Return windows (n,): as many as there are blocks, cut where the DVL is silent."""
     silent = np.cumsum(np.diff(t_dvl, prepend=t_dvl[0]) > GAP_S)
     piece = silent[np.searchsorted(t_dvl, t_s).clip(0, len(t_dvl) - 1)]
     even = np.arange(len(t_s)) * BLOCKS // len(t_s)
-    return np.cumsum((np.diff(piece, prepend=piece[0]) > 0) | (np.diff(even, prepend=0) > 0))
+    return np.cumsum((np.diff(piece, prepend=piece[0]) > 0) | (np.diff(even, prepend=0) > 0), dtype=np.intp)
 
 
 def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> Answer | None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from fathom.bench.drawing import empty_figure
 from fathom.bench.inspection.answers import Delay
 from fathom.bench.inspection.clock import weigh
 from fathom.bench.inspection.cross import cross_checks
@@ -17,6 +19,7 @@ from fathom.bench.inspection.fitting import Estimate, blocks_of, least_squares
 from fathom.bench.inspection.lever_arm import products
 from fathom.datasets import Log, Scenario, open_log, simulate
 from fathom.datasets.folder import write_folder
+from fathom.datasets.log import DvlStream
 from fathom.datasets.opening import CATALOG
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -74,7 +77,7 @@ OTHER = {"yaw": "compass", "compass": "yaw", "up": "down", "down": "up", "FRD": 
 
 
 def mend(file: Path, finding: Finding) -> None:
-    """Put into a description what a finding proposes, as a reader would: sums on top of what stands there."""
+    """Put into a description what a finding proposes, as a reader would, on top of what stands there."""
     described = yaml.safe_load(file.read_text())
     path, said = finding.mend.split(": ", 1)
     text, _, remark = said.partition("#")
@@ -87,6 +90,8 @@ def mend(file: Path, finding: Finding) -> None:
         value = float(remark.split()[-1])
     if path.endswith(("offset", "offset_s", "add_deg")) and now is not None:
         value += now
+    if path.endswith("scale") and now is not None:
+        value = np.multiply(value, now).tolist()
     if path.endswith("time.delay_s"):
         change(described, path.replace("delay_s", "received"), None)  # a delay is stated or received, not both
     change(described, path, value)
@@ -114,6 +119,31 @@ def test_a_log_without_a_sensor_is_checked_by_the_others(absent: str) -> None:
     log = sail(**{absent: None})
     assert findings(log) == []
     assert not [c.title for c in cross_checks(log) if absent in c.title.lower() and "heading" not in absent]
+
+
+def test_a_car_has_no_depth_no_heading_and_a_dvl_of_one_axis() -> None:
+    log = sail(heading=None, depth=None, dvl={"faults": {"scale": 1.03}})
+    assert log.dvl is not None
+    sigma = log.dvl.sigma.copy()
+    sigma[:, 1:] = np.inf
+    wheels = DvlStream(log.dvl.t_ns, log.dvl.received_ns, log.dvl.z * [1.0, np.pi, np.pi], sigma)
+    checks = cross_checks(replace(log, dvl=wheels))
+    value, sigma_of_it = fact(checks, PATH, "scale that the DVL needs")
+    assert abs(value - 1 / 1.03) < max(3 * sigma_of_it, 0.002)  # what was not measured is taken for zero
+    (velocity,) = (check for check in checks if check.title == VELOCITY)
+    assert [velocity.facts[f"DVL less truth, {axis}"] for axis in ("left", "up")] == ["not measured"] * 2
+    found = {finding.mend.split(": ")[0] for check in checks for finding in check.findings}
+    assert found == {"streams.dvl.velocity.scale"}
+
+
+def test_every_panel_draws_itself() -> None:
+    drawn = 0
+    for check in cross_checks(sail()):
+        if check.draw is not None:
+            _, (axes,) = empty_figure(1, 1, 4, 3)
+            check.draw(axes)
+            drawn += axes.has_data()
+    assert drawn >= 6
 
 
 # (b) faults that the simulator plants
@@ -207,7 +237,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "dvl late": ({"streams.dvl.time.clock_offset_s": 0.3}, "streams.dvl.time.delay_s"),
     "heading turned": ({"streams.heading.add_deg": 6.0}, "streams.heading.add_deg"),
     "imu mounting": (
-        {"streams.imu.mounting": {"R_BS": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]}},
+        {"streams.imu.mounting": {"yaw_deg": -90, "translation_m": [-0.35, 0.05, 0.12]}},
         "streams.imu.mounting",
     ),
     "heading in degrees": ({"streams.heading.heading.unit": "deg"}, "streams.heading.heading.unit"),
