@@ -123,7 +123,8 @@ def least_squares(columns: dict[str, Array], y: Array, block: Index) -> Fit | No
 def _jackknife(X: Array, y: Array, block: Index) -> tuple[Array, Array]:
     """Return coefficients and covariance, no variance smaller than white noise of the residual's size would give."""
     size = np.sqrt((X**2).sum(axis=0))
-    size[size == 0] = 1.0
+    empty = size == 0
+    size[empty] = 1.0
     X = X / size
     order = np.argsort(block, kind="stable")
     edges = np.flatnonzero(np.diff(block[order])) + 1
@@ -137,8 +138,11 @@ def _jackknife(X: Array, y: Array, block: Index) -> tuple[Array, Array]:
     spread = without - beta
     cov = (len(parts) - 1) / len(parts) * spread.T @ spread
     white = np.sum((y - X @ beta) ** 2) / (len(y) - len(beta)) * np.linalg.inv(whole)
-    grow = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(cov), 1e-300), 1.0))
-    return beta / size, cov * np.outer(grow, grow) / np.outer(size, size)
+    least, found = np.diag(white), np.diag(cov)
+    grow = np.sqrt(np.maximum(least / np.maximum(found, 1e-12 * least + 1e-300), 1.0))
+    cov = cov * np.outer(grow, grow) / np.outer(size, size)
+    np.fill_diagonal(cov, np.where(empty, np.inf, np.maximum(found, least) / size**2))
+    return beta / size, cov
 
 
 def mean_of(y: Array, block: Index) -> Estimate | None:

@@ -17,9 +17,9 @@ from fathom.bench.inspection.cross import cross_checks
 from fathom.bench.inspection.findings import Check, Finding
 from fathom.bench.inspection.fitting import Estimate, blocks_of, least_squares
 from fathom.bench.inspection.lever_arm import products
-from fathom.datasets import Log, Scenario, open_log, simulate
+from fathom.datasets import Log, Scenario, Trajectory, open_log, simulate
 from fathom.datasets.folder import write_folder
-from fathom.datasets.log import DvlStream
+from fathom.datasets.log import DvlStream, ImuStream
 from fathom.datasets.opening import CATALOG
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
@@ -134,6 +134,18 @@ def test_a_car_has_no_depth_no_heading_and_a_dvl_of_one_axis() -> None:
     assert [velocity.facts[f"DVL less truth, {axis}"] for axis in ("left", "up")] == ["not measured"] * 2
     found = {finding.mend.split(": ")[0] for check in checks for finding in check.findings}
     assert found == {"streams.dvl.velocity.scale"}
+
+
+def test_odd_logs_are_checked_as_far_as_they_go() -> None:
+    log = sail()
+    assert log.truth is not None
+    bare = Trajectory(log.truth.t_ns[::10], np.full_like(log.truth.R_WB[::10], np.nan), log.truth.p_WB_W[::10])
+    dead = ImuStream(log.imu.t_ns, 0 * log.imu.w_WI_I, 0 * log.imu.f_I + [0.0, 0.0, -9.8])
+    cut = sail(imu_faults={"outages_s": [[60, 63]]}, dvl={"faults": {"outages_s": [[100, 160]]}})
+    for odd in (replace(log, truth=None), replace(log, truth=bare), cut, sail(duration_s=20)):
+        assert findings(odd) == []
+    titles = {check.title: check for check in cross_checks(replace(log, imu=dead, dvl=None, truth=None))}
+    assert "not observable" in titles["gyro against heading"].facts["heading by gyro, slope"]
 
 
 def test_every_panel_draws_itself() -> None:
