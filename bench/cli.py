@@ -210,6 +210,36 @@ def _scenario(text: str) -> Scenario:
 
 
 @app.command()
+def inspect(
+    log: Annotated[
+        str, typer.Argument(help="A recorded log's name, a folder with a log.yaml, or a description (.yaml).")
+    ],
+    data: Data = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Figure (.png, .pdf, .svg), or a folder; inspect-NAME.png without."),
+    ] = None,
+) -> None:
+    """Look over LOG before anything runs on it: what each sensor says, what looks wrong, and how log.yaml mends it."""
+    with refusing_bad_input():
+        from rich.console import Console
+
+        from .inspection.inspecting import inspect_log, open_to_inspect
+        from .inspection.page import page_file, print_inspection, save_page
+
+        page_file(out, "")  # refuses before anything is read
+        with Console(stderr=True).status(f"inspecting {log}") as status:
+            opened, repairs = open_to_inspect(log, data)
+            inspection = inspect_log(opened, repairs)
+            file = page_file(out, opened.name)
+            status.update(f"drawing {file}")
+            save_page(inspection, file)
+        console = Console()
+        print_inspection(inspection, console if console.is_terminal else Console(width=120))
+        typer.echo(f"figure: {file}")
+
+
+@app.command()
 def score(
     truth: Annotated[Path, typer.Argument(help="TUM file: t x y z qx qy qz qw.")],
     estimate: Annotated[Path, typer.Argument(help="TUM file.")],

@@ -1,0 +1,89 @@
+"""Inspect a log: put every question to it, and gather what looks wrong."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...datasets.errors import DatasetError
+from ...datasets.log import Log
+from ...datasets.opening import RecordingNotFound, open_log
+from .findings import Check, Finding
+from .imu_noise import check_imu_noise
+from .noise import check_noise
+from .norms import check_norms
+from .outliers import check_outliers
+from .rates import check_delays, check_rates
+from .static import check_static
+from .values import check_values
+
+SINGLE = (
+    check_rates,
+    check_delays,
+    check_values,
+    check_outliers,
+    check_norms,
+    check_static,
+    check_imu_noise,
+    check_noise,
+)
+REPAIRED = re.compile(r"^(\w+): (\d+) rows (.+) \(repair\) dropped$")
+MENDS = {
+    "out of order": "streams.{}.time.column: the one that runs evenly; else drop those rows in the file",
+    "not finite": "streams.{}.valid: {{column: …, values: […]}} leaves those rows out",
+    "received before they were true": "streams.{0}.time.received and .clock_offset_s: the two are not on one clock",
+}
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What was found in one log, check by check."""
+
+    log: Log
+    checks: tuple[Check, ...]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Everything that looks wrong, in the order of the checks."""
+        return tuple(finding for check in self.checks for finding in check.findings)
+
+
+def open_to_inspect(name: str | Path, data: Path | None = None) -> tuple[Log, tuple[str, ...]]:
+    """Open a log, repaired only if it does not open otherwise; return it and the notes of what was repaired.
+
+    Raises:
+        DatasetError: it does not open even so.
+    """
+    try:
+        return open_log(name, data), ()
+    except RecordingNotFound:
+        raise
+    except DatasetError:
+        log = open_log(name, data, repair=True)
+        return log, tuple(note for note in log.notes if REPAIRED.match(note))
+
+
+def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Inspection:
+    """Put every check to a log; `repairs` are the notes of what opening it has had to drop."""
+    from .cross import cross_checks
+
+    checks = [check(log) for check in SINGLE]
+    return Inspection(log, (_check_repairs(log, repairs), *checks, *cross_checks(log)))
+
+
+def _check_repairs(log: Log, repairs: Sequence[str]) -> Check:
+    """Tell what was dropped to open the log."""
+    findings = [Finding("imc", f"The file is damaged: {note}.") for note in log.notes if note.startswith("imc: ")]
+    for note in repairs:
+        match = REPAIRED.match(note)
+        if match is not None:
+            stream, count, what = match.groups()
+            mend = MENDS.get(what, "").format(stream)
+            findings.append(Finding(stream, f"{count} {stream} rows are {what}; they were left out here.", mend))
+    duration = f"{log.duration_s:.1f} s"
+    streams = ", ".join(["imu", *log.streams, *([log.truth_kind] if log.truth is not None else [])])
+    dropped = "; ".join(note for note in log.notes if note.endswith("dropped"))
+    facts = {"duration": duration, "streams": streams} | ({"left out": dropped} if dropped else {})
+    return Check("opening", facts, tuple(findings))
