@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 OFF = 3.0
 """Factor between stated and found sigma that is worth a word: nine in the weight of a reading."""
 
+MOVING = 2.0
+"""How much larger the scatter of every second reading must be to be of motion: it holds up to 16 times more of that."""
 NOISIER, NOISY_SHARE, FEWEST_BLOCKS = 2.0, 0.05, 10
 """A robust sigma of a hundred residuals is known to 12 %: twice the usual is eight of its own sigmas away."""
 
@@ -36,16 +38,18 @@ def check_noise(log: Log) -> Check:
         measured = np.isfinite(stated)
         rounding = rounding_sigma(channel)
         floor = np.maximum(sigma, rounding)
+        moving = _every_second(channel) > MOVING * sigma
         alive = measured & (np.ptp(channel.x, axis=0) > 0)
         facts[channel.name] = "; ".join(
             f"{channel.of_axis(k)} {floor[k] * channel.shown:.2g}, stated {channel.told(float(stated[k]))}"
+            + (" (motion is in it)" if moving[k] else "")
             for k in np.flatnonzero(measured).tolist()
         )
         ratio = np.divide(floor, stated, out=np.full(len(stated), np.nan), where=alive)
         ratios += [(channel, k, float(ratio[k])) for k in np.flatnonzero(alive).tolist() if ratio[k] > 0]
-        findings += _off(channel, floor, np.where((rounding > sigma) & (ratio > 1), np.nan, ratio)) + _changing(
-            log, channel, measured, rounding
-        )
+        findings += _off(
+            channel, floor, np.where((moving | (rounding > sigma)) & (ratio > 1), np.nan, ratio)
+        ) + _changing(log, channel, measured, rounding)
 
     def draw(axes: Axes) -> None:
         names = [channel.of_axis(k) for channel, k, _ in ratios]
@@ -61,6 +65,11 @@ def check_noise(log: Log) -> Check:
         axes.set_xlabel("scatter from reading to reading / stated sigma")
 
     return Check("noise of the aiding sensors", facts, tuple(findings), draw if ratios else None)
+
+
+def _every_second(channel: Channel) -> Array:
+    """Return the scatter (k,) of every second reading: that of white noise is the same, that of motion much larger."""
+    return noise_sigma(channel.rows(np.arange(len(channel.x)) % 2 == 0))
 
 
 def _changing(log: Log, channel: Channel, measured: NDArray[np.bool_], rounding: Array) -> list[Finding]:

@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 G = 9.80665
 MISREAD = {
-    1 / G: "it is in g: streams.imu.accel.unit: g",
-    1e3 / G: "it is in mg: streams.imu.accel.unit: mg",
-    G: "it is in m/s² already: streams.imu.accel.unit: m/s^2",
-    G / 1e3: "it is in m/s² already: streams.imu.accel.unit: m/s^2",
-    1e3: "it is in mm/s²: streams.imu.accel: {unit: m/s^2, scale: 0.001}",
-    1e2: "it is in cm/s²: streams.imu.accel: {unit: m/s^2, scale: 0.01}",
-    1 / 0.3048: "it is in ft/s²: streams.imu.accel: {unit: m/s^2, scale: 0.3048}",
+    1 / G: ("g", "unit: g"),
+    1e3 / G: ("mg", "unit: mg"),
+    G: ("m/s² already", "unit: m/s^2"),
+    G / 1e3: ("m/s² already", "unit: m/s^2"),
+    1e3: ("mm/s²", "{unit: m/s^2, scale: 0.001}"),
+    1e2: ("cm/s²", "{unit: m/s^2, scale: 0.01}"),
+    1 / 0.3048: ("ft/s²", "{unit: m/s^2, scale: 0.3048}"),
 }
-"""|f| over gravity, for units mistaken for one another."""
+"""|f| over gravity, for units mistaken for one another: in which it is, and what log.yaml should say of it."""
 UNIT_TOLERANCE = 0.1
 NO_GRAVITY = 0.2
 """Of gravity: a mean |f| below it has had gravity taken out."""
@@ -71,12 +71,7 @@ def check_norms(log: Log) -> Check:
         "|rate|, 99 %": f"{rate:.4g} rad/s ({rate / DEGREE:.3g} °/s)",
         "tilting of f against the gyro": f"slope {tilting.slope:.3g}, correlation {tilting.correlation:.2f}",
     }
-    misread = _misread(ratio)
-    findings = [
-        Finding("imu", f"The specific force is {size:.4g} m/s² strong where gravity is {rig.gravity:.4g}.", misread)
-    ]
-    if not misread:
-        findings = _strength(log, norm)
+    findings = _misread(size, rig.gravity) or _strength(log, norm)
     findings += _upright(rig, np.median(f_I, axis=0), size)
     findings += _rates(rate, tilting)
 
@@ -94,8 +89,13 @@ def check_norms(log: Log) -> Check:
     return Check("gravity, units and axes of the IMU", facts, tuple(findings), draw)
 
 
-def _misread(ratio: float) -> str:
-    return next((what for factor, what in MISREAD.items() if abs(ratio / factor - 1) < UNIT_TOLERANCE), "")
+def _misread(size: float, gravity: float) -> list[Finding]:
+    """Find a specific force in another unit than the one stated."""
+    for factor, (unit, mend) in MISREAD.items():
+        if abs(size / gravity / factor - 1) < UNIT_TOLERANCE:
+            says = f"The specific force is {size:.4g} m/s² strong where gravity is {gravity:.4g}: it is in {unit}."
+            return [Finding("imu", says, f"streams.imu.accel{': ' if mend[0] == '{' else '.'}{mend}")]
+    return []
 
 
 def _strength(log: Log, norm: Array) -> list[Finding]:
@@ -159,10 +159,12 @@ def levelled(R_BI: Array, up_B: Array) -> tuple[Array, bool]:
     square = bool(abs(up_B[axis]) > np.cos(SQUARE_DEG * DEGREE))
     if square:
         up_B = np.sign(up_B[axis]) * np.eye(3)[axis]
-    turn = np.cross(up_B, [0.0, 0.0, 1.0])
-    length = float(np.linalg.norm(turn))
-    angle = np.arctan2(length, up_B[2])
-    return Rotation.from_rotvec(turn / max(length, 1e-12) * angle).as_matrix() @ R_BI, square
+    axis_B = np.cross(up_B, [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(axis_B))
+    if length < 1e-9:  # up or down already
+        axis_B, length = np.array([1.0, 0.0, 0.0]), 1.0
+    angle = np.arccos(np.clip(up_B[2], -1.0, 1.0))
+    return Rotation.from_rotvec(axis_B / length * angle).as_matrix() @ R_BI, square
 
 
 def gyro_against_gravity(log: Log) -> Tilting:

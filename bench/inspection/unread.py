@@ -44,7 +44,7 @@ def unread_rows(channel: Channel) -> Unread:
     for axis, quantum in zip(x.T, quanta, strict=True):
         off = np.abs(axis - np.median(axis))
         spread = max(MAD_TO_SIGMA * float(np.median(off)), quantum)
-        far = off > MARKER_FAR * spread
+        far = (off > MARKER_FAR * spread) & (axis != 0)
         if spread == 0 or not far.any():
             continue
         values, counts = np.unique(axis[far], return_counts=True)
