@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...datasets.log import Log
-from ...datasets.state import TimeArray
+from ...datasets.state import Array, TimeArray
 from ..drawing import logarithmic
 from .findings import Check, Finding
 from .looks import colour_of, thinned
@@ -31,7 +31,6 @@ LONGEST_GAP_S = 5.0
 """Tilted by half a degree, which is what accelerometers level to, inertial dead reckoning is 1 m off after 5 s."""
 LONGEST_IMU_GAP_S = 0.1
 """Turning at 10 °/s, the vehicle has turned by a degree that no gyro saw."""
-UNCOUNTED_GAP_S = 10.0
 
 
 def check_rates(log: Log) -> Check:
@@ -44,7 +43,7 @@ def check_rates(log: Log) -> Check:
             continue
         interval_s = np.diff(t_ns) * 1e-9
         period_s = float(np.median(interval_s))
-        lost = _lost(interval_s, period_s)
+        lost = _lost(name, interval_s, period_s)
         clustered = float(np.mean(interval_s < CLUSTERED * period_s))
         ratio = interval_s / period_s
         jitter = float(np.std(ratio - np.rint(ratio)))  # a lost reading is no jitter
@@ -84,13 +83,18 @@ def _times(log: Log) -> dict[str, TimeArray]:
     return {"imu": log.imu.t_ns} | {name: stream.t_ns for name, stream in log.streams.items()}
 
 
+def _longest_gap_s(name: str, period_s: float) -> float:
+    """Return from where on a gap is a silence, and no number of lost readings."""
+    return max(LONGEST_IMU_GAP_S if name == "imu" else LONGEST_GAP_S, 3 * period_s)
+
+
 def _since(log: Log, t_ns: int) -> float:
     return (t_ns - log.start_ns) * 1e-9
 
 
-def _lost(interval_s: np.ndarray, period_s: float) -> int:
-    """Return how many readings are missing: those a long interval should hold, less those a short one has too many."""
-    short = interval_s[interval_s < UNCOUNTED_GAP_S + 1.5 * period_s]
+def _lost(name: str, interval_s: Array, period_s: float) -> int:
+    """Return how many readings are missing between silences; two in the time of one make up for a missing one."""
+    short = interval_s[interval_s <= _longest_gap_s(name, period_s)]
     return max(int((np.rint(short / period_s) - 1).sum()), 0)
 
 
@@ -130,12 +134,12 @@ def _gaps(log: Log, name: str, t_ns: TimeArray, lost: int) -> list[Finding]:
                 name, f"{share:.1%} of the {name} readings are missing: {lost}, by their rate, between others{by_hand}."
             )
         )
-    longest_s = LONGEST_IMU_GAP_S if name == "imu" else LONGEST_GAP_S
+    longest_s = _longest_gap_s(name, float(np.median(np.diff(t_ns))) * 1e-9)
     ends_ns = [] if name == "imu" else [log.start_ns, int(log.imu.t_ns[-1])]
     inside = t_ns[(t_ns >= log.start_ns) & (t_ns <= log.imu.t_ns[-1])]
     edges_ns = np.sort(np.concatenate([inside, np.array(ends_ns, np.int64)]))
     gap_s = np.diff(edges_ns) * 1e-9
-    long = np.flatnonzero(gap_s > max(longest_s, 3 * float(np.median(np.diff(t_ns))) * 1e-9))
+    long = np.flatnonzero(gap_s > longest_s)
     if len(long):
         at = long[np.argmax(gap_s[long])]
         count = "one silence" if len(long) == 1 else f"{len(long)} silences"

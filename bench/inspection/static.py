@@ -64,13 +64,17 @@ def rests(log: Log) -> list[Rest]:
         means.append((averaged.mean(axis=1), allowed))
     starts_ns, ends_ns = t_ns[0:n:size], t_ns[size - 1 : n : size]
     quiet &= _still_by_dvl(log, starts_ns, ends_ns)
-    found = []
+    found, turns = [], []
     for first, last in _runs(quiet):
         for a, b in _steady(first, last, means):
             long = (ends_ns[b] - starts_ns[a]) * 1e-9 >= SHORTEST_S - 2 * part_s
             if long and _stays(log, int(starts_ns[a]), int(ends_ns[b])):
                 found.append(Rest(a * size, (b + 1) * size - 1))
-    return found
+                turns.append(means[0][0][a : b + 1].mean(axis=0))
+    if not found:
+        return []
+    least = turns[int(np.argmin(np.linalg.norm(turns, axis=1)))]  # a steady turn looks like rest, but turns more
+    return [rest for rest, turn in zip(found, turns, strict=True) if np.abs(turn - least).max() <= means[0][1]]
 
 
 def _whole(t_ns: TimeArray, period_ns: int) -> NDArray[np.bool_]:
