@@ -97,7 +97,8 @@ def _panel(log: Log, found: dict[str, Marked]) -> Callable[[Axes], None] | None:
                 label = None
             low, high = np.quantile(channel.x[~out] * channel.shown, [0.001, 0.999])
             room = max(high - low, 1e-9)
-            axes.set_ylim(max(x.min(), low - room) - 0.1 * room, min(x.max(), high + room) + 0.1 * room)
+            far_low, far_high = max(x.min(), low - room), min(x.max(), high + room)
+            axes.set_ylim(min(low, far_low) - 0.2 * room, max(high, far_high) + 0.2 * room)
         if len(unread_ns):
             at = {"transform": axes.get_xaxis_transform(), "color": "black", "ms": 8}
             axes.plot((unread_ns - log.start_ns) * 1e-9, np.full(len(unread_ns), 0.02), "|", label="no reading", **at)

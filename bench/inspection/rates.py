@@ -70,7 +70,10 @@ def check_rates(log: Log) -> Check:
         for order, (name, t_ns) in enumerate(times.items()):
             if len(t_ns) > 2:
                 t_s, interval_s = (t_ns[1:] - log.start_ns) * 1e-9, np.diff(t_ns) * 1e-9
-                kept, look = thinned(interval_s), {"ms": 1.5 + order, "zorder": 9 - order, "color": colour_of(name)}
+                kept, look = (
+                    thinned(interval_s),
+                    {"ms": 1.5 + order, "zorder": 3 - order / 10, "color": colour_of(name)},
+                )
                 axes.plot(t_s[kept], interval_s[kept], ".", label=name, rasterized=True, **look)
         axes.set(xlabel="time, s", ylabel="interval, s")
         logarithmic(axes, "y")
@@ -193,6 +196,7 @@ def check_delays(log: Log) -> Check:
                 t_s, kept = (log.streams[name].t_ns - log.start_ns) * 1e-9, thinned(late_s)
                 axes.plot(t_s[kept], late_s[kept], ".", ms=2, color=colour_of(name), label=name, rasterized=True)
         axes.set(xlabel="time, s", ylabel="received after it was true, s")
+        axes.set_ylim(bottom=0)
         axes.legend(fontsize=6, markerscale=3)
 
     return Check("delays", facts, tuple(findings), draw if any(late_s.any() for late_s in late.values()) else None)
