@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 OFF = 3.0
 """Factor between stated and found sigma that is worth a word: nine in the weight of a reading."""
 
+UNSURE = 1.65
+"""Relative error of a robust sigma of n residuals, times √n: 1.17, and √2 more as neighbours share readings."""
 MOVING = 2.0
 """How much larger the scatter of every second reading must be to be of motion: it holds up to 16 times more of that."""
 NOISIER, NOISY_SHARE, FEWEST_BLOCKS = 2.0, 0.05, 10
@@ -102,7 +104,8 @@ def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
     with np.errstate(divide="ignore"):
         off = np.where(np.isfinite(ratio) & (ratio > 0), np.abs(np.log(ratio)), 0.0)
     k = int(np.argmax(off))
-    if off[k] <= np.log(OFF):
+    count = int(np.isfinite(residuals(channel)).all(axis=1).sum())
+    if off[k] <= np.log(OFF) + 2 * UNSURE / np.sqrt(count):
         return []
     large = ratio[k] > 1
     how = f"{ratio[k]:.1f} times" if large else f"1/{1 / ratio[k]:.3g} of"
