@@ -14,6 +14,7 @@ import typer
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ..datasets.recording import Recording
     from ..datasets.scenario import Scenario
     from ..datasets.trajectory import Trajectory
     from .experiment import Experiment
@@ -212,7 +213,11 @@ def _scenario(text: str) -> Scenario:
 @app.command()
 def inspect(
     log: Annotated[
-        str, typer.Argument(help="A recorded log's name, a folder with a log.yaml, or a description (.yaml).")
+        str,
+        typer.Argument(
+            help="A recorded log's name, a folder with a log.yaml, a description (.yaml), or a bare recording (.bag, "
+            ".db3, .mcap, .bin, .lsf), whose messages are then listed."
+        ),
     ],
     data: Data = None,
     out: Annotated[
@@ -224,9 +229,15 @@ def inspect(
     with refusing_bad_input():
         from rich.console import Console
 
+        from .inspection.contents import print_contents
         from .inspection.inspecting import inspect_log, open_to_inspect
         from .inspection.page import page_file, print_inspection, save_page
 
+        undescribed = _undescribed(Path(log))
+        if undescribed is not None:
+            held = undescribed.contents(Path(log).parent)
+            print_contents(held, Console() if sys.stdout.isatty() else Console(width=120))
+            return
         page_file(out, "")  # refuses before anything is read
         with Console(stderr=True).status(f"inspecting {log}") as status:
             opened, repairs = open_to_inspect(log, data)
@@ -237,6 +248,15 @@ def inspect(
         console = Console()
         print_inspection(inspection, console if console.is_terminal else Console(width=120))
         typer.echo(f"figure: {file}")
+
+
+def _undescribed(path: Path) -> Recording | None:
+    """Return the loader of a bare recording: a file, or the folder of a ROS 2 bag."""
+    from ..datasets.recording import loader, recording_at
+
+    if (path / "metadata.yaml").is_file() and not (path / "log.yaml").is_file():
+        return loader("ros")(format="ros", file=path.name)
+    return recording_at(path) if path.is_file() else None
 
 
 @app.command()

@@ -92,6 +92,7 @@ class ArduPilotRecording(Recording):
     """
 
     host_clock: ClassVar = ("TimeUS", "us")
+    suffixes: ClassVar = (".bin",)
 
     def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
         """Read the messages asked for; see `Recording.read`.

@@ -34,6 +34,7 @@ class McapRecording(TopicRecording):
     """An MCAP file. Messages are topics; `log_time` is when each was recorded, `publish_time` when it was sent."""
 
     host_clock = ("log_time", "ns")
+    suffixes: ClassVar = (".mcap",)
     stamps: ClassVar = ("log_time", "publish_time")
 
     def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:

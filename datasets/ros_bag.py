@@ -37,6 +37,7 @@ class RosRecording(TopicRecording):
     """A ROS bag, version 1 or 2, as it is found. Messages are topics; `log_time` is when each was recorded."""
 
     host_clock = ("log_time", "ns")
+    suffixes = (".bag", ".bag.active", ".db3")
 
     more: tuple[str, ...] = ()
     """Further files of a split ROS 1 bag, in their order; the folder of a ROS 2 bag names its own."""

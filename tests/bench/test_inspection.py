@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import allantools
 import numpy as np
 import pandas as pd
 import pytest
@@ -380,15 +379,17 @@ def test_a_wrongly_stated_density_is_told_at_rest_and_the_right_one_proposed(fac
 # Allan deviation
 
 
-def test_allan_deviation_is_that_of_allantools() -> None:
+def test_allan_deviation_is_its_definition_taken_literally() -> None:
+    """Half the mean square difference of neighbouring means, over every start (IEEE Std 952)."""
     rng = np.random.default_rng(6)
     rates = 3.0 + rng.standard_normal((4000, 2)) + 0.03 * np.cumsum(rng.standard_normal((4000, 2)), axis=0)
     curve = allan_deviation(rates, 0.02)
     assert len(curve.tau_s) > 20
     for axis, ours in zip(rates.T, curve.deviation.T, strict=True):
-        taus, theirs, _, _ = allantools.oadev(axis, rate=50.0, data_type="freq", taus=curve.tau_s)
-        np.testing.assert_allclose(taus, curve.tau_s, rtol=1e-12)
-        np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+        for tau_s, deviation in list(zip(curve.tau_s, ours, strict=True))[::4]:
+            m = round(tau_s / 0.02)
+            means = np.array([axis[k : k + m].mean() for k in range(len(axis) - m + 1)])
+            assert deviation == pytest.approx(np.sqrt(0.5 * np.mean((means[m:] - means[:-m]) ** 2)), rel=1e-9)
 
 
 def test_allan_deviation_of_a_ramp_is_its_slope_over_root_two() -> None:
