@@ -1,4 +1,4 @@
-"""An experiment: which estimators on which logs, from which seeds, scored how; one YAML file."""
+"""An experiment: which estimators on which logs, from which seeds, scored and compared how; one YAML file."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import yaml
-from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from ..datasets.errors import nearest
 from ..datasets.log import Log
 from ..datasets.opening import CATALOG
 from ..datasets.scenario import Scenario
-from ..estimators.interface import Estimator
+from ..estimators.interface import FACTORS, Estimator, sensors_among
 from ..estimators.registry import create
 from .metrics import Alignment, Dims
+from .paired import OVER_SEEDS, Comparison
 from .run import Scoring
+from .variants import Grid, changed, points
 
 STRICT = ConfigDict(extra="forbid", populate_by_name=True)
 SHIPPED = Path(__file__).parent / "experiments"
@@ -45,6 +48,10 @@ class LogSpec:
         log: a name that `fathom list logs` prints, or a folder with a log.yaml.
         name: what tables call it; made from the mission and the IMU, or from the folder, when left out.
         align, dims: override the experiment's scores for this log.
+        grid: keys of the scenario, dotted where they are nested, and the values that they take: the entry stands for a
+            log at every point of it.
+        estimators: labels, or patterns of labels, of those that run on it; all, when left out.
+        baseline: the name of the log with which each estimator's scores on this one are compared, seed by seed.
     """
 
     scenario: dict[str, Any] | None = None
@@ -52,16 +59,39 @@ class LogSpec:
     name: str = ""
     align: Alignment | None = None
     dims: Dims | None = None
+    grid: Grid = Field(default_factory=dict)
+    estimators: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    baseline: str | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> LogSpec:
         if (self.scenario is None) == (self.log is None):
             raise ValueError("a log needs either `scenario` or `log`, and not both")
+        if self.log is not None and (self.grid or self.baseline):
+            raise ValueError(f"`{'grid' if self.grid else 'baseline'}` is for simulated logs, which share their seeds")
         if self.scenario is not None:
             Scenario.from_dict(self.scenario)
         if not self.name:
             object.__setattr__(self, "name", self._default_name())
+        self.variants()
         return self
+
+    def variants(self) -> tuple[LogSpec, ...]:
+        """Return the logs that this entry stands for: itself, where it has no grid.
+
+        Raises:
+            ValueError: a point of the grid is no scenario (a DatasetError that names the key).
+        """
+        if not self.grid:
+            return (self,)
+        return tuple(
+            replace(self, name=f"{self.name} {words}", scenario=changed(self.scenario or {}, changes), grid={})
+            for words, changes in points(self.grid)
+        )
+
+    def runs_on_it(self, label: str) -> bool:
+        """Return whether the estimator of this label does."""
+        return self.estimators is None or any(fnmatchcase(label, pattern) for pattern in self.estimators)
 
     def _default_name(self) -> str:
         if self.log is not None:
@@ -107,6 +137,9 @@ class LogSpec:
         return open_log(self.log, data=data, repair=repair)
 
 
+Sensors = Annotated[tuple[str, ...], sensors_among(FACTORS)]
+
+
 @dataclass(frozen=True, config=STRICT)
 class EstimatorSpec:
     """One estimator of an experiment.
@@ -115,23 +148,63 @@ class EstimatorSpec:
         name: as in `fathom list estimators`.
         label: what tables call it; the name, when left out. No two may be the same.
         options: written `with:`; the options that differ from the estimator's defaults.
+        grid: options, dotted where they are nested, and the values that they take: the entry stands for an estimator
+            at every point of it.
+        drop: sensors; besides the entry as it is there is one without each of them, compared with it.
+        only: sets of sensors; likewise one with none but those of each set.
+        baseline: the label with which the entry, or every point of its grid, is compared; else the experiment's.
     """
 
     name: str
     label: str = ""
     options: dict[str, Any] = Field(default_factory=dict, alias="with")
+    grid: Grid = Field(default_factory=dict)
+    drop: Sensors = ()
+    only: tuple[Sensors, ...] = ()
+    baseline: str | None = None
 
     @model_validator(mode="after")
     def _known(self) -> EstimatorSpec:
         self.create()
         if not self.label:
             object.__setattr__(self, "label", self.name)
+        self.variants()
         return self
 
     @cached_property
     def config(self) -> Any:
         """What a run's spec says of the estimator's options: every one, defaults included."""
         return plain(self.create())
+
+    def variants(self) -> tuple[EstimatorSpec, ...]:
+        """Return the estimators that this entry stands for: itself, or its grid; each followed by those with less.
+
+        Raises:
+            ValueError: an option of the grid is unknown or cannot take a value (an EstimatorError); or there is no such
+                sensor to drop or to keep.
+        """
+        if not (self.grid or self.drop or self.only):
+            return (self,)
+        found = []
+        for words, changes in points(self.grid):
+            options = changed(self.options, changes)
+            full = replace(self, label=f"{self.label} {words}".rstrip(), options=options, grid={}, drop=(), only=())
+            has = full.create().factors
+            less = {f"no {sensor}": has - {sensor} for sensor in self.drop}
+            less |= {f"only {' + '.join(kept) or 'the IMU'}": frozenset(kept) for kept in self.only}
+            for sensor in sorted({*self.drop, *(sensor for kept in self.only for sensor in kept)} - has):
+                raise ValueError(f"{full.label} does not use {sensor!r} (it uses: {', '.join(sorted(has))})")
+            found.append(full)
+            found += [
+                replace(
+                    full,
+                    label=f"{full.label} {words}",
+                    options=options | {"factors": sorted(factors)},
+                    baseline=full.label,
+                )
+                for words, factors in less.items()
+            ]
+        return tuple(found)
 
     def create(self) -> Estimator:
         """Return the configured estimator.
@@ -151,6 +224,13 @@ def _counted_from_one(seeds: Any) -> Any:
     return tuple(range(1, seeds + 1))
 
 
+def _can_be_compared(scores: tuple[str, ...]) -> tuple[str, ...]:
+    for score in scores:
+        _refuse_unknown("no score to compare by", score, OVER_SEEDS)
+    _refuse_twice("score", scores)
+    return scores
+
+
 class Run(NamedTuple):
     """One estimator on one log; seed is None for a recorded log."""
 
@@ -167,6 +247,8 @@ class Run(NamedTuple):
 class Experiment:
     """Every estimator on every log; simulated logs once per seed, recorded logs once.
 
+    Entries that stand for several (`grid`, `drop`, `only`) are replaced by what they stand for.
+
     Attributes:
         name: its folder under `results`.
         description: what it asks, in a sentence or two.
@@ -174,6 +256,9 @@ class Experiment:
         seeds: of the simulated logs, or how many, counted from 1; all estimators share a seed's log, so differences are
             paired.
         scores: how runs are scored; a log may override `align` and `dims`.
+        baseline: the label with which every estimator is compared that names no other.
+        compare: scores in which variants are compared with their baselines; every one more is more tests to correct
+            for.
         max_gap_s: longest gap in the IMU that is bridged.
         timeout_s: longest time for one run.
     """
@@ -186,14 +271,30 @@ class Experiment:
         tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1), BeforeValidator(_counted_from_one)
     ] = (1,)
     scores: Scoring = Scoring()
+    baseline: str | None = None
+    compare: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_can_be_compared)] = (
+        "ate_rmse_m",
+        "heading_rmse_deg",
+        "velocity_rmse_m_s",
+    )
     max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0
 
     @model_validator(mode="after")
-    def _no_duplicates(self) -> Experiment:
-        _refuse_twice("label", (estimator.label for estimator in self.estimators))
-        _refuse_twice("log name", (log.name for log in self.logs))
+    def _expanded(self) -> Experiment:
+        object.__setattr__(self, "estimators", tuple(each for entry in self.estimators for each in entry.variants()))
+        object.__setattr__(self, "logs", tuple(each for entry in self.logs for each in entry.variants()))
+        labels, names = [estimator.label for estimator in self.estimators], [log.name for log in self.logs]
+        _refuse_twice("label", labels)
+        _refuse_twice("log name", names)
         _refuse_twice("seed", self.seeds)
+        for label in (self.baseline, *(estimator.baseline for estimator in self.estimators)):
+            _refuse_unknown("baseline: no estimator has the label", label, labels)
+        for log in self.logs:
+            _refuse_unknown("baseline: no log has the name", log.baseline, names)
+            for pattern in log.estimators or ():
+                if not any(fnmatchcase(label, pattern) for label in labels):
+                    _refuse_unknown(f"{log.name}: estimators: no label matches", pattern, labels)
         return self
 
     @classmethod
@@ -233,6 +334,21 @@ class Experiment:
             for log in self.logs
             for seed in (self.seeds if log.scenario is not None else (None,))
             for estimator in self.estimators
+            if log.runs_on_it(estimator.label)
+        ]
+
+    def comparisons(self) -> list[Comparison]:
+        """Return which estimator on which log is compared with which on which.
+
+        Each with its own baseline on the same log, and with itself on the log's baseline.
+        """
+        ran = {(log.name, each.label) for log in self.logs for each in self.estimators if log.runs_on_it(each.label)}
+        return [
+            Comparison(log.name, each.label, str(of_log), str(of_label))
+            for log in self.logs
+            for each in self.estimators
+            for of_log, of_label in ((log.name, each.baseline or self.baseline), (log.baseline, each.label))
+            if (of_log, of_label) != (log.name, each.label) and {(log.name, each.label), (of_log, of_label)} <= ran
         ]
 
     def scoring(self, log: LogSpec) -> Scoring:
@@ -288,6 +404,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _refuse_unknown(complaint: str, name: str | None, known: Iterable[str]) -> None:
+    known = list(known)
+    if name is not None and name not in known:
+        raise ValueError(f"{complaint} {name!r}{nearest(name, known)} (known: {', '.join(known)})")
 
 
 def _refuse_twice(what: str, values: Iterable[Any]) -> None:
