@@ -107,19 +107,23 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
     """Write the CSV files and the figures of all that was ever run of this plan, and print the tables of these rows."""
     from .experiment import ExperimentError
     from .figures import draw_figures
+    from .paired import paired
     from .runner import rows_of
     from .store import load_runs
-    from .table import print_table, write_consistency, write_table
+    from .table import print_table, write_consistency, write_paired, write_table
 
     every = rows_of(load_runs(folder), plan.runs())
+    differences = paired(every, plan.comparisons(), plan.compare)
     try:
         write_table(every, folder / "table.csv")
         write_consistency(every, folder / "consistency.csv")
-        figures = draw_figures(every, folder)
+        write_paired(differences, folder / "paired.csv")
+        figures = draw_figures(every, folder, differences)
     except OSError as error:
         raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
-    _say(f"{folder}: runs.sqlite, table.csv, consistency.csv, {len(figures)} figures")
-    print_table(rows)
+    _say(f"{folder}: runs.sqlite, table.csv, consistency.csv, paired.csv, {len(figures)} figures")
+    shown = set(zip(rows["log"], rows["label"], strict=True))
+    print_table(rows, differences=[row for row in differences if (row["log"], row["label"]) in shown])
     standing, renewed = rows.attrs["standing"], rows.attrs["renewed"]
     if standing:
         _say(f"{standing} runs were done already; --force does them again")

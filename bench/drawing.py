@@ -42,13 +42,18 @@ def looks_of(labels: Sequence[str]) -> dict[str, Look]:
 
 
 def empty_figure(
-    lines: int, columns: int, width_in: float, height_in: float, share_x: bool = True
+    lines: int,
+    columns: int,
+    width_in: float,
+    height_in: float,
+    share_x: bool = True,
+    heights: Sequence[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure that needs no display, and its axes row by row."""
+    """Return a figure that needs no display, and its axes row by row; `heights` are those of the rows to each other."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     with rc_context({"axes.labelsize": 8, "axes.titlesize": 9}):
-        grid = figure.subplots(lines, columns, squeeze=False, sharex=share_x)
+        grid = figure.subplots(lines, columns, squeeze=False, sharex=share_x, height_ratios=heights)
     panels: list[Axes] = list(grid.ravel())
     for axes in panels:
         axes.tick_params(labelsize=7)

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 
 from ..datasets.state import Array
 from ..datasets.trajectory import Trajectory
+from .ablation_figure import draw_ablation
 from .consistency import FALSE_ALARM, anees_of
 from .drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
 from .lag_figure import draw_lag_curve, lag_curve
@@ -36,12 +37,13 @@ class Track(NamedTuple):
     estimate: Trajectory
 
 
-def draw_figures(rows: pd.DataFrame, folder: Path) -> list[Path]:
+def draw_figures(rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = ()) -> list[Path]:
     """Draw every figure of an experiment into folder/figures and return the files.
 
     Args:
         rows: of the store; each simulated log is drawn with the first of its seeds.
         folder: the experiment's, with its trajectories.
+        differences: what `paired` found.
     """
     every, summary = records(rows), summarise(rows)
     looks = looks_of([label for (label,) in groups(every, "label")])
@@ -61,6 +63,10 @@ def draw_figures(rows: pd.DataFrame, folder: Path) -> list[Path]:
         files += save(draw_tracks(tracks, looks, title), Path(f"{stem}-tracks"))
         if any(track.truth is not None for track in tracks):
             files += save(draw_errors(tracks, looks, title), Path(f"{stem}-errors"))
+    known = [row for row in differences if row["ratio"] is not None]
+    for (log,), of_log in groups(known, "baseline_log").items():
+        stem = folder / "figures" / re.sub(r"[^\w.=+-]+", "_", log)
+        files += save(draw_ablation(of_log, looks, log), Path(f"{stem}-ablation"))
     priced = [row for row in summary if row["ate_rmse_m"] is not None and row["real_time_factor"] is not None]
     if priced:
         files += save(draw_costs(priced, looks), folder / "figures" / "accuracy-cost")

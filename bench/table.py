@@ -16,6 +16,7 @@ from rich.text import Text
 
 from .floor_ratio import OVER
 from .metrics import BLOCKS
+from .paired import FEWEST_SEEDS, PAIRED
 from .run import INNOVATIONS
 from .summary import CONSISTENCY, OUTLIERS, Record, consistency, groups, is_judged, records, summarise
 
@@ -29,6 +30,16 @@ SHOWN = {
     "step_p99_us": "\np99",
     "real_time_factor": "× real\ntime",
 }
+SCORE_NAMES: dict[str, str] = {name: " ".join(heading.split()) for name, heading in SHOWN.items()} | {
+    "rotation_rmse_deg": "rotation °",
+    "velocity_rmse_m_s": "velocity m/s",
+    "drift_max_percent": "worst drift %",
+    "outage_percent": "outage %",
+    "nees_position": "NEES",
+    "step_median_us": "step µs",
+    "step_p99_us": "step p99 µs",
+}
+"""What paired tables and figures call scores, see `score_name`."""
 BLOCK_HEADINGS = ("ANEES   \npos", "\natt", "\nvel", "\nbias", "\nall")
 NIS_HEADINGS = {"nis_dvl": "dvl", "nis_depth": "depth", "nis_gps": "gps", "nis_heading": "head"}
 ABSENT = "–"
@@ -45,11 +56,17 @@ def write_consistency(rows: pd.DataFrame, path: Path) -> None:
     pd.DataFrame(consistency(rows), columns=list(CONSISTENCY)).to_csv(path, index=False)
 
 
-def print_table(rows: pd.DataFrame, console: Console | None = None) -> None:
+def write_paired(differences: Sequence[Record], path: Path) -> None:
+    """Write what `paired` returns as CSV."""
+    pd.DataFrame(differences, columns=list(PAIRED)).to_csv(path, index=False)
+
+
+def print_table(rows: pd.DataFrame, console: Console | None = None, differences: Sequence[Record] = ()) -> None:
     """Print the tables of each log, then what did not come to its end, and whose readings were mostly of no use.
 
     Accuracy and cost for every log; the floor where it was asked for; honesty where NIS was asked for, or seeds are
-    enough for ANEES; late readings and outliers where there were any.
+    enough for ANEES; late readings and outliers where there were any; then the `differences` that `paired` found, a
+    table per baseline.
     """
     if console is None:
         console = Console()
@@ -61,6 +78,9 @@ def print_table(rows: pd.DataFrame, console: Console | None = None) -> None:
             if table is not None:
                 console.print(table)
                 console.print()
+    for table in _paired(differences):
+        console.print(table)
+        console.print()
     for line in failures(rows) + mostly_outside(rows) + not_positive(every):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
 
@@ -191,8 +211,90 @@ def _late_or_out(summary: Sequence[Record]) -> Table | None:
     return table
 
 
-def _empty(title: str, caption: str, headings: Iterable[str]) -> Table:
-    """Return a table without rows, whose first column is the estimator's."""
+def _paired(differences: Sequence[Record]) -> list[Table]:
+    """Return a table per baseline; what its columns mean stands under the last one."""
+    tables = []
+    headings = ("sees\nahead", "\nscore", "\nbaseline", "\nΔ", "\n95 %", "\n%", "p\n(Holm)", "\nr", "\nseeds")
+    for (log, label), of_baseline in groups(differences, "baseline_log", "baseline_label").items():
+        table = _empty(f"{log}: against {label}", "", headings, "variant")
+        before = None
+        named = [row | {"who": who(row), "ahead": _both_lookaheads(row)} for row in of_baseline]
+        for (name, ahead), rows in groups(named, "who", "ahead").items():
+            for k, row in enumerate(rows):
+                table.add_row(Text("" if k or name == before else name), "" if k else ahead, *_difference(row))
+            before = name
+        tables.append(table)
+    if tables:
+        tables[-1].caption = Text(_paired_caption(differences), "table.caption")
+    return tables
+
+
+def score_name(score: str) -> str:
+    """Return what a paired table or figure calls a score: its own name, where SCORE_NAMES has no shorter one."""
+    return SCORE_NAMES.get(score, score)
+
+
+def who(row: Record) -> str:
+    """Return how the variant of a paired record is called beside its baseline: by its label or log, or by both."""
+    if row["log"] == row["baseline_log"]:
+        return row["label"]
+    return row["log"] if row["label"] == row["baseline_label"] else f"{row['log']}: {row['label']}"
+
+
+def _both_lookaheads(row: Record) -> str:
+    own, other = _lookahead(row), _lookahead({"lookahead_s": row["baseline_lookahead_s"]})
+    return own if own == other else f"{own} v. {other}"
+
+
+def _difference(row: Record) -> list[str]:
+    """Return the cells of one score's difference."""
+    seeds = f"{row['pairs']}" if row["pairs"] == row["runs"] else f"{row['pairs']}/{row['runs']}"
+    name = score_name(row["score"])
+    if not row["pairs"]:
+        return [name, *[ABSENT] * 6, seeds]
+    interval = ABSENT if row["low"] is None else f"[{_signed(row['low'])}, {_signed(row['high'])}]"
+    p, r = row["p_holm"], row["rank_biserial"]
+    return [
+        name,
+        _three_figures(row["baseline"]),
+        _signed(row["difference"]),
+        interval,
+        percent(row["ratio"]),
+        ABSENT if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}",
+        ABSENT if r is None else f"{r:+.2f}",
+        seeds,
+    ]
+
+
+def _signed(value: float) -> str:
+    return f"{'+' if value > 0 else ''}{_three_figures(value)}"
+
+
+def percent(ratio: float | None) -> str:
+    """Return by how much a ratio is more or less than 1; from ten times on, how many times."""
+    if ratio is None:
+        return ABSENT
+    change = 100 * (ratio - 1)
+    return f"× {_three_figures(ratio)}" if ratio >= 10 else f"{change:+.0f}" if change >= 100 else f"{change:+.1f}"
+
+
+def _paired_caption(differences: Sequence[Record]) -> str:
+    tests = [row for row in differences if row["p_holm"] is not None]
+    lines = [
+        "Δ: variant less baseline, over the seeds both ended; 95 %: bootstrap over seeds (with 20, right in 90 %)",
+        f"p: Wilcoxon's signed-rank test over seeds, corrected by Holm for {len(tests)} tests;"
+        " r: its rank-biserial correlation, ±1 where all seeds agree",
+    ]
+    if not tests:
+        return f"{lines[0]}\nneither intervals nor tests: they need {FEWEST_SEEDS} seeds of a simulated log"
+    least = min(len(tests) * 2.0 ** (1 - row["pairs"]) for row in tests)
+    if least > 0.05:
+        lines.append(f"so many tests on so few seeds give no p under {min(1.0, least):.2g}: take more, or compare less")
+    return "\n".join(lines)
+
+
+def _empty(title: str, caption: str, headings: Iterable[str], first: str = "estimator") -> Table:
+    """Return a table without rows; its first column says of whom."""
     table = Table(
         title=Text(title, "table.title"),
         caption=Text(caption, "table.caption"),
@@ -203,7 +305,7 @@ def _empty(title: str, caption: str, headings: Iterable[str]) -> Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    table.add_column("estimator", overflow="fold", min_width=14)
+    table.add_column(first, overflow="fold", min_width=14)
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     return table
