@@ -59,7 +59,9 @@ def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: 
     handles = [Patch(facecolor="#555555", edgecolor="#555555", label="at once")]
     if any(row["output"] == "hindsight" for row in differences):
         handles.append(Patch(facecolor="white", edgecolor="#555555", label="with hindsight"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    if seeds:
+        handles.append(Patch(facecolor="none", label="pale number: p (Holm) of 0.05 or more"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
 
 
