@@ -25,7 +25,7 @@ from .device_clock import common_instants
 from .errors import DatasetError
 from .geodesy import SEMI_MAJOR_M, ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
 from .log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
-from .recording import Wanted
+from .recording import Recording, Wanted
 from .rig import Rig
 from .state import Array, TimeArray
 from .trajectory import Trajectory
@@ -62,24 +62,25 @@ class _Opening:
         if self.messages is None:
             self._read_messages()
         assert self.messages is not None
-        assert self.description.recording is not None
+        recording = self.description.recording
+        assert recording is not None
         found = [self.messages[name, message.entity] for name in message.names]
         picks: list[Any] = [slice(None)] * len(found)
         device: Array | None = None
         if message.clock is not None:
-            column, unit = self.description.recording.host_clock
+            column, unit = recording.host_clock
             host_s = [part[column] * (NS_PER[unit] * 1e-9) for part in found]
             device_s = [part[message.clock.field].astype(float) for part in found]
             picks, device = common_instants(host_s, device_s, message.clock.wraps_at_s)
             if not len(device):
-                where = self.description.recording.path(self.folder)
+                where = recording.path(self.folder)
                 raise DatasetError(f"{where}: {' and '.join(message.names)} have no device time in common")
         columns: Columns = {}
         for column in wanted:
             if column == DEVICE and device is not None:
                 columns[column] = device
             else:
-                which, field_name = _field(message, str(column), self.folder)
+                which, field_name = _field(message, str(column), recording, self.folder)
                 columns[column] = found[which][field_name][picks[which]]
         return columns
 
@@ -97,16 +98,16 @@ class _Opening:
                     columns |= dict.fromkeys((recording.host_clock[0], part.message.clock.field))
             for column in wanted:
                 if column != DEVICE or part.message.clock is None:
-                    which, field_name = _field(part.message, str(column), self.folder)
+                    which, field_name = _field(part.message, str(column), recording, self.folder)
                     asked[part.message.names[which], part.message.entity][field_name] = None
         read = recording.read(self.folder, [Wanted(*key, tuple(columns)) for key, columns in asked.items()])
         self.messages = dict(zip(asked, read.columns, strict=True))
         self.notes += read.notes
 
 
-def _field(message: d.Message, column: str, folder: Path) -> tuple[int, str]:
-    """Return which of the joined messages a column is of, and its field there."""
-    if len(message.names) == 1:
+def _field(message: d.Message, column: str, recording: Recording, folder: Path) -> tuple[int, str]:
+    """Return which of the joined messages a column is of, and its field there; the host's stamp is the first one's."""
+    if len(message.names) == 1 or column == recording.host_clock[0]:
         return 0, column
     for which, name in enumerate(message.names):
         if column.startswith(f"{name}."):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from ...datasets.log import Log
 from ...datasets.state import Array
@@ -24,7 +25,7 @@ from .fitting import (
     windows_of,
     without_trend,
 )
-from .inertial import Inertial, headings, seconds
+from .inertial import LEVEL_S, Inertial, headings, seconds
 from .velocity import fit_path, positions
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def gyro_against_heading(log: Log, imu: Inertial) -> Answer | None:
                     f"streams.imu.noise.gyro_bias_sigma: {1.2 * abs(found.bias.value):.2g}",
                 )
             )
-    spread = _spread_by_time(log, found) if turning and abs(found.slope.value - 1) < 0.3 else None
+    spread = _spread_by_time(log, imu, found) if turning and abs(found.slope.value - 1) < 0.3 else None
     if spread is not None:
         facts["heading less gyro, rms by time apart"] = ", ".join(
             f"{np.degrees(np.sqrt(max(v, 0))):.2g}° in {lag:.3g} s" for lag, v in spread.shown
@@ -298,11 +299,13 @@ class Spread:
     slow: float
     correlation_s: float
     growth: Estimate
+    tilt: float
+    """Of the growth, what a level that leans in turns may be to blame for, rad²."""
 
     def findings(self, log: Log, found: GyroHeading) -> list[Finding]:
         """Return whether the stated sigma forgets that errors last."""
         assert log.heading is not None
-        if not self.growth.differs(0.0, SLOW_MATTERS**2):
+        if not self.growth.differs(0.0, SLOW_MATTERS**2 + self.tilt):
             return []
         stated = float(np.median(np.min(log.heading.sigma, axis=1)))
         period_s = float(np.median(np.diff(seconds(log, log.heading.t_ns))))
@@ -323,7 +326,19 @@ class Spread:
         ]
 
 
-def _spread_by_time(log: Log, found: GyroHeading) -> Spread | None:
+def _blamed_on_tilt(log: Log, imu: Inertial) -> float:
+    """Return the variance, rad², of headings that the level's lean in turns can make out of nothing.
+
+    The accelerometers take a turning vehicle's own acceleration for a lean, and a lean of δ turns the azimuth of an
+    axis that is pitched by θ by δ tan θ. It may change its sign, and half the mean square of 2 δ tan θ is 2 (δ tan θ)².
+    """
+    mean_f = uniform_filter1d(imu.f_L, max(round(LEVEL_S / imu.period_s), 1), axis=0, mode="nearest")
+    lean = np.sqrt(np.maximum(np.sum(mean_f**2, axis=1) / log.rig.gravity**2 - 1.0, 0.0))
+    tilt = np.tan(np.arccos(np.clip(imu.up_L[:, 2], 0.1, 1.0)))
+    return float(2.0 * np.mean((lean * tilt) ** 2))
+
+
+def _spread_by_time(log: Log, imu: Inertial, found: GyroHeading) -> Spread | None:
     """Compare heading errors some time apart; the gyro's own noise is taken off."""
     t_s, left = found.t_s[found.kept], found.left[found.kept]
     if len(t_s) < 50:
@@ -360,7 +375,9 @@ def _spread_by_time(log: Log, found: GyroHeading) -> Spread | None:
     growth, _, top = max(growths, key=lambda each: each[0].value - each[0].reach)  # where it is surest
     slow = max(top - white, 0.0)
     correlation_s = next(lag for lag, value in shown if value - white >= 0.63 * slow)
-    return Spread(shown[:: max(len(shown) // 6, 1)], max(white, 0.0), slow, correlation_s, growth)
+    return Spread(
+        shown[:: max(len(shown) // 6, 1)], max(white, 0.0), slow, correlation_s, growth, _blamed_on_tilt(log, imu)
+    )
 
 
 def heading_against_truth(log: Log) -> Answer | None:

@@ -596,7 +596,13 @@ NAIVE_ICTINEU = {
 LIMU = {"names": ["AngularVelocity", "Acceleration"], "entity": 65, "clock": {"field": "time", "wraps_at_s": 64}}
 NAIVE_LAUV = {
     "name": "lauv_naive",
-    "imc": {"file": "samples.zip", "member": "auv/Data.lsf", "definitions": "auv/IMC.xml.gz", "source": 27},
+    "recording": {
+        "format": "imc",
+        "file": "samples.zip",
+        "member": "auv/Data.lsf",
+        "definitions": "auv/IMC.xml.gz",
+        "source": 27,
+    },
     "streams": {
         "imu": {
             "message": LIMU,
