@@ -129,6 +129,7 @@ def preintegrate_dvl(
     return out
 
 
+@njit(cache=True)
 def given_rotation(N: Array) -> tuple[Array, Array]:
     """Return K (3, 3) m/rad and C (3, 3) m²: given φ, the error of Δp has mean K φ and covariance C.
 
@@ -136,4 +137,4 @@ def given_rotation(N: Array) -> tuple[Array, Array]:
     a multiple of I; a perfect gyro has none, and then there is nothing to lay anywhere.
     """
     K = N[3:, :3] / N[0, 0] if N[0, 0] > 0.0 else np.zeros((3, 3))
-    return K, N[3:, 3:] - K @ N[:3, 3:]
+    return K, N[3:, 3:] - product(K, N[:3, 3:])

@@ -38,7 +38,7 @@ from .gtsam_border import (
 )
 from .imu import BLOCK, STATE, compile_rig, first_sample, integrate, over_world, predict, process_noise, sandwich
 from .innovation import normalised_square
-from .interface import FACTORS, Diverged, Factors, Inflation
+from .interface import FACTORS, Diverged, Factors, Inflation, Pass
 from .measurements import measure
 from .records import as_belief, as_record, split, with_rate_noise
 from .robust import Loss, Losses, distance, m_estimator, rows, width, with_loss
@@ -96,7 +96,6 @@ class GraphSmoother(ABC):
             marginalised out. Tukey and, less so, Cauchy have no single minimum: what lies beyond the width at the
             first guess, the IMU's prediction, has no pull and is not reconsidered unless others move the estimate. So
             a vehicle that is lost by more than the width never hears that sensor again.
-        factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
         hindsight_covariance_s: period at which states with hindsight keep their covariance.
         earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
@@ -110,7 +109,6 @@ class GraphSmoother(ABC):
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     robust: Losses = Field(default_factory=dict)
-    factorization: Literal["QR", "CHOLESKY"] = "QR"
     hindsight_covariance_s: Positive = 5.0
     earth_rotation: bool = False
 
@@ -120,8 +118,8 @@ class GraphSmoother(ABC):
         """How long a state is kept before it leaves with what has been learnt of it; infinite for the whole log."""
 
     @abstractmethod
-    def solver(self, R_BI: Array) -> Solver:
-        """Return a new solver for one pass."""
+    def begin(self, prior: Belief, rig: Rig) -> Pass:
+        """See `Estimator.begin`."""
 
     @property
     def preintegrates(self) -> bool:
@@ -133,7 +131,22 @@ class GraphSmoother(ABC):
         """Time between keyframes; 0 for one at every DVL reading."""
         return self.keyframe_period_s or (1.0 if self.preintegrates else 0.0)
 
-    def begin(self, prior: Belief, rig: Rig) -> GraphPass:
+
+@dataclass(frozen=True)
+class GtsamSmoother(GraphSmoother):
+    """What the smoothers on GTSAM can be told besides.
+
+    Attributes:
+        factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
+    """
+
+    factorization: Literal["QR", "CHOLESKY"] = "QR"
+
+    @abstractmethod
+    def solver(self, R_BI: Array) -> Solver:
+        """Return a new solver for one pass."""
+
+    def begin(self, prior: Belief, rig: Rig) -> Pass:
         """See `Estimator.begin`."""
         return GraphPass(self, prior, rig)
 
@@ -162,9 +175,9 @@ class Keyframe:
 
 
 class GraphPass:
-    """One pass of a `GraphSmoother`."""
+    """One pass of a `GtsamSmoother`."""
 
-    def __init__(self, config: GraphSmoother, prior: Belief, rig: Rig) -> None:
+    def __init__(self, config: GtsamSmoother, prior: Belief, rig: Rig) -> None:
         self.counts: Counter[str] = Counter()
         self._config = config
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)

@@ -14,7 +14,7 @@ from .eskf_filterpy import FilterpyKalmanFilter
 from .iekf import InvariantKalmanFilter
 from .interface import Estimator
 from .rts import RauchTungStriebelSmoother
-from .smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother
+from .smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother, WindowSmoother
 from .ukf import UnscentedKalmanFilter
 
 ESTIMATORS: dict[str, Any] = {
@@ -28,6 +28,7 @@ ESTIMATORS: dict[str, Any] = {
     "fls-batch": BatchFixedLagSmoother,
     "isam2": WholeLogSmoother,
     "batch": BatchSmoother,
+    "window": WindowSmoother,
 }
 
 
