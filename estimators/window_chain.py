@@ -50,14 +50,14 @@ NODE = np.dtype(
 """Nodes lie in a ring whose length is a power of two: keyframe k in slot k & (length − 1)."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_scaled(out: Array, a: float, x: Array) -> None:
     """out += a x, for fifteen components."""
     for i in range(DIM):
         out[i] += a * x[i]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def absorb_row(r: float, h: Array, variance: float, m: Array, P: Array) -> bool:
     """Add the row r + h δ, of some variance, to N(m, P) of δ; False where the innovation's variance is not positive."""
     PH = np.zeros(DIM)
@@ -76,7 +76,7 @@ def absorb_row(r: float, h: Array, variance: float, m: Array, P: Array) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def absorb_joint_row(
     r: float, h_i: Array, h_j: Array, variance: float,
     m_i: Array, P_i: Array, m_j: Array, P_j: Array, P_ji: Array,
@@ -104,7 +104,7 @@ def absorb_joint_row(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j: Array, P_ji: Array) -> None:
     """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P and P_j = F P Fᵀ + Q."""
     P_ij = np.empty((DIM, DIM))
@@ -125,7 +125,7 @@ def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j:
     symmetrise(P_j)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def symmetrise(P: Array) -> None:
     """Make P (15, 15) symmetric to the last bit."""
     for i in range(DIM):
@@ -133,7 +133,7 @@ def symmetrise(P: Array) -> None:
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def divide_into(P: Array, A: Array, X: Array) -> bool:
     """Fill X = P⁻¹ A, all (15, 15), by elimination of P's correlations; False where P is no covariance.
 
@@ -169,20 +169,28 @@ def divide_into(P: Array, A: Array, X: Array) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
     """Fill the increments d of keyframes low to newest."""
-    mask = len(nodes) - 1
+    mask, x = len(nodes) - 1, np.empty(DIM)
     nodes[newest & mask].d[:] = nodes[newest & mask].m
     for k in range(newest - 1, low - 1, -1):
         n, ahead = nodes[k & mask], nodes[(k + 1) & mask]
-        Gt, d, d_j, m_j = n.Gt, n.d, ahead.d, ahead.m_given
-        d[:] = n.m
+        Gt, m, d, d_j, m_j = n.Gt, n.m, n.d, ahead.d, ahead.m_given
         for j in range(DIM):
-            add_scaled(d, d_j[j] - m_j[j], Gt[j])
+            x[j] = d_j[j] - m_j[j]
+        for i in range(0, DIM, 5):  # five sums at a time stay in registers
+            d_0, d_1, d_2, d_3, d_4 = m[i], m[i + 1], m[i + 2], m[i + 3], m[i + 4]
+            for j in range(DIM):
+                d_0 += Gt[j, i] * x[j]
+                d_1 += Gt[j, i + 1] * x[j]
+                d_2 += Gt[j, i + 2] * x[j]
+                d_3 += Gt[j, i + 3] * x[j]
+                d_4 += Gt[j, i + 4] * x[j]
+            d[i], d[i + 1], d[i + 2], d[i + 3], d[i + 4] = d_0, d_1, d_2, d_3, d_4
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def step_back(node: NDArray[Any], ahead: NDArray[Any], P: Array) -> None:
     """Turn P, the covariance with hindsight of the next keyframe, into that of this one; both NODEs of length 1."""
     Gt, P_given, own = node[0].Gt, ahead[0].P_given, node[0].P
@@ -197,7 +205,7 @@ def step_back(node: NDArray[Any], ahead: NDArray[Any], P: Array) -> None:
     symmetrise(P)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def covariance_with_hindsight(nodes: NDArray[Any], k: int, newest: int) -> Array:
     """Return the covariance (15, 15) of δ_k, given all there is; it costs a step for every keyframe since k."""
     mask = len(nodes) - 1

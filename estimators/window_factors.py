@@ -12,10 +12,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..datasets.state import DIM, THETA, Array
+from ..datasets.state import DIM, POSITION, THETA, VELOCITY, Array
 from .imu import STATE, predict, process_noise
 from .measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
-from .so3 import exp, log, product, right_jacobian
+from .so3 import exp, log, product, right_jacobian, skew
 
 AT_KEYFRAME, CARRIED, LOOSE, TIGHT = range(4)
 """What a factor is: a reading that was true at its keyframe, one that the IMU carries there, and displacements."""
@@ -41,7 +41,7 @@ FACTOR = np.dtype(
 """Lies beside its READING, its BLOCK where it is carried, and its DISPLACEMENT where it is one: same row of each."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def weight_of(loss: int, d: float, width: float) -> float:
     """w(d) of `robust`."""
     if loss == 1:
@@ -53,7 +53,7 @@ def weight_of(loss: int, d: float, width: float) -> float:
     return 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def whiten(n: int, C: Array, r: Array, H: Array, H_j: Array) -> bool:
     """Divide n rows by the Cholesky factor of their covariance C, which is used up; False where it has none."""
     for k in range(n):
@@ -75,7 +75,7 @@ def whiten(n: int, C: Array, r: Array, H: Array, H_j: Array) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def linearise_factor(
     factors: NDArray[Any], f: int, readings: NDArray[Any], carries: NDArray[Any], displacements: NDArray[Any],
     x_i: NDArray[Any], x_j: NDArray[Any], rig: NDArray[Any],
@@ -123,7 +123,7 @@ def linearise_factor(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def chain(n: int, A: Array, F: Array, out: Array) -> None:
     """out = A F for n rows."""
     for i in range(n):
@@ -135,7 +135,7 @@ def chain(n: int, A: Array, F: Array, out: Array) -> None:
                     out[i, j] += A[i, k] * F[k, j]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def length(r: Array, n: int) -> float:
     """Of the first n components."""
     total = 0.0
@@ -144,7 +144,7 @@ def length(r: Array, n: int) -> float:
     return math.sqrt(total)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def distance(factors: NDArray[Any], f: int, d_i: Array, d_j: Array) -> float:
     """Length of a factor's whitened residual at increments (15,) from where it was last linearised."""
     g, r = factors[f], np.empty(3)
@@ -155,14 +155,19 @@ def distance(factors: NDArray[Any], f: int, d_i: Array, d_j: Array) -> float:
     return length(r, g.n)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def linearise_tie(
     block: NDArray[Any], x_i: NDArray[Any], x_j: NDArray[Any], gravity: float, F: Array, Q: Array, c: Array
 ) -> None:
     """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records.
 
-    The residual is x_j ⊖ f(x_i), with f the prediction. Where x_j lies e off it, an error that starts at f(x_i) is
-    carried there by Exp(−e), and noise by J_r(e); all but the rotation is additive.
+    With x the prediction from x_i, the residual stands in the axes of B at j, as GTSAM's does (it matters only where
+    one of the two is kept while the other moves):
+
+        e = Log(Rᵀ R_j)     R_jᵀ e_p = R_jᵀ (p_j − p)     R_jᵀ e_v = R_jᵀ (v_j − v)     b_j − b
+
+    Where x_j lies e off x, a rotation error that starts at x is carried there by Exp(−e), noise by J_r(e), and the two
+    positions and velocities are seen turned by it: δp_j gains −[e_p]× R_j δθ_j, and δv_j likewise.
     """
     end = np.empty(1, STATE)
     predict(block, x_i, gravity, F, end)
@@ -173,29 +178,42 @@ def linearise_tie(
         c[i] = -e[i]
         c[3 + i], c[6 + i] = a.p_WB_W[i] - b.p_WB_W[i], a.v_WB_W[i] - b.v_WB_W[i]
         c[9 + i], c[12 + i] = a.b_a[i] - b.b_a[i], a.b_g[i] - b.b_g[i]
-    if e[0] != 0.0 or e[1] != 0.0 or e[2] != 0.0:
-        back, J = exp(-e), right_jacobian(e)
-        turned = F[THETA].copy()
-        for i in range(3):
+    A = np.zeros((9, 3))  # what p and v gain by the rotation of j; c is minus the residual
+    A[3:6], A[6:9] = product(skew(c[POSITION]), b.R_WB), product(skew(c[VELOCITY]), b.R_WB)
+    turn_rows(F, exp(-e))
+    turn_error(Q, right_jacobian(e))
+    for i in range(3, 9):
+        for k in range(3):
+            c[i] += A[i, k] * c[k]
             for j in range(DIM):
-                F[i, j] = back[i, 0] * turned[0, j] + back[i, 1] * turned[1, j] + back[i, 2] * turned[2, j]
-        turn_error(Q, J)
+                F[i, j] += A[i, k] * F[k, j]
+                Q[i, j] += A[i, k] * Q[k, j]
+    for i in range(3, 9):
+        for k in range(3):
+            for j in range(DIM):
+                Q[j, i] += A[i, k] * Q[j, k]
 
 
-@njit(cache=True)
-def turn_error(P: Array, J: Array) -> None:
-    """P ← A P Aᵀ with A = diag(J, I): the covariance (15, 15) of an error whose rotation is J times the one before."""
-    old = P[THETA].copy()
+@njit(cache=True, error_model="numpy")
+def turn_rows(F: Array, J: Array) -> None:
+    """F ← diag(J, I) F."""
+    old = F[THETA].copy()
     for i in range(3):
         for j in range(DIM):
-            P[i, j] = J[i, 0] * old[0, j] + J[i, 1] * old[1, j] + J[i, 2] * old[2, j]
+            F[i, j] = J[i, 0] * old[0, j] + J[i, 1] * old[1, j] + J[i, 2] * old[2, j]
+
+
+@njit(cache=True, error_model="numpy")
+def turn_error(P: Array, J: Array) -> None:
+    """P ← A P Aᵀ with A = diag(J, I): the covariance (15, 15) of an error whose rotation is J times the one before."""
+    turn_rows(P, J)
     old_columns = P[:, THETA].copy()
     for j in range(DIM):
         for i in range(3):
             P[j, i] = J[i, 0] * old_columns[j, 0] + J[i, 1] * old_columns[j, 1] + J[i, 2] * old_columns[j, 2]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
     """Fill N(m, P) of the error at x that N(mean, anchor.P) of the error at the anchor makes; STATE records."""
     a, s = anchor[0], x[0]
@@ -212,7 +230,7 @@ def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array
     turn_error(P, J)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def move(x: NDArray[Any], d: Array) -> None:
     """x ← x ⊕ d, a STATE record's P left as it is."""
     s = x[0]

@@ -141,13 +141,13 @@ class Store(NamedTuple):
     rig: NDArray[Any]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def slot(s: Store, k: int) -> int:
     """Where keyframe k lies in the rings."""
     return k & (len(s.nodes) - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def estimate(s: Store, k: int) -> NDArray[Any]:
     """Return keyframe k as it is believed now, a STATE record; its P is of no meaning."""
     a = slot(s, k)
@@ -162,7 +162,7 @@ STEP, SOLVE, CLOSE = range(3)
 """What `drive` is asked for: to take in an epoch; to solve with late readings; to let every state leave."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def drive(s: Store, asked: int, imu: NDArray[Any], readings: NDArray[Any], t_ns: int, tick: bool) -> int:
     """Take in an epoch, or what else is asked for, which may have no samples and no readings.
 
@@ -221,7 +221,7 @@ def drive(s: Store, asked: int, imu: NDArray[Any], readings: NDArray[Any], t_ns:
     return DONE
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def lacks(s: Store, n_imu: int, n_readings: int, t_ns: int) -> int:
     """What might run out in an epoch of so much; nothing needs more than this allows for."""
     w, short = s.w[0], 0
@@ -242,7 +242,7 @@ def lacks(s: Store, n_imu: int, n_readings: int, t_ns: int) -> int:
     return short
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def believe(s: Store, out: NDArray[Any]) -> int:
     """Fill `out`, a STATE record, with the belief at this moment: the newest keyframe's, carried on as a filter would."""
     w = s.w[0]
@@ -277,7 +277,7 @@ def believe(s: Store, out: NDArray[Any]) -> int:
 # --- readings and keyframes ------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def in_order(readings: NDArray[Any]) -> TimeArray:
     """Return the rows in the order of their truth; those of one moment stay as they are."""
     order = np.arange(len(readings))
@@ -290,7 +290,7 @@ def in_order(readings: NDArray[Any]) -> TimeArray:
     return order
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def receive(s: Store, readings: NDArray[Any]) -> NDArray[Any]:
     """Put every reading of an epoch where it belongs; return those that may call for keyframes."""
     w, order = s.w[0], in_order(readings)
@@ -314,7 +314,7 @@ def receive(s: Store, readings: NDArray[Any]) -> NDArray[Any]:
     return calls[:n]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def calls_for_keyframe(s: Store, reading: Any) -> bool:
     """Whether a READING makes a keyframe; see `GraphSmoother`."""
     w = s.w[0]
@@ -327,7 +327,7 @@ def calls_for_keyframe(s: Store, reading: Any) -> bool:
     return silent_ns >= w.timeout_ns and since_ns >= max(w.period_ns - w.merge_ns, w.timeout_ns - w.merge_ns)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def receive_late(s: Store, reading: NDArray[Any]) -> None:
     """Tie a reading older than the newest keyframe to the one before it, if that is still in the window."""
     w = s.w[0]
@@ -341,7 +341,7 @@ def receive_late(s: Store, reading: NDArray[Any]) -> None:
     add_reading(s, k, accept(s, reading))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def make_keyframe(s: Store, t_ns: int) -> int:
     """Close the newest keyframe's interval at t_ns, start the next one there, and hand the pending readings out.
 
@@ -385,7 +385,7 @@ def make_keyframe(s: Store, t_ns: int) -> int:
     return stays
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def split_imu(s: Store, t_ns: int) -> int:
     """Split the samples of the newest keyframe at t_ns; return where those after it begin."""
     w = s.w[0]
@@ -401,7 +401,7 @@ def split_imu(s: Store, t_ns: int) -> int:
     return lo + n + w.imu_gone
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def head_of(imu: NDArray[Any], t_ns: int) -> tuple[NDArray[Any], int, bool]:
     """Return samples up to t_ns, how many are whole, and whether one more straddles t_ns: the last, then cut short."""
     n = 0
@@ -419,7 +419,7 @@ def head_of(imu: NDArray[Any], t_ns: int) -> tuple[NDArray[Any], int, bool]:
 # --- factors ---------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def accept(s: Store, reading: NDArray[Any]) -> int:
     """Return a free factor's row, with the reading in it."""
     w = s.w[0]
@@ -430,7 +430,7 @@ def accept(s: Store, reading: NDArray[Any]) -> int:
     return f
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def give_back(s: Store, first: int) -> None:
     """Free a chain of factors."""
     w = s.w[0]
@@ -442,7 +442,7 @@ def give_back(s: Store, first: int) -> None:
         first = following
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_reading(s: Store, k: int, f: int) -> None:
     """Make row f, whose reading is there, a factor on keyframe k, carried by the IMU where it was true later."""
     w = s.w[0]
@@ -462,7 +462,7 @@ def add_reading(s: Store, k: int, f: int) -> None:
     w.unsolved = min(w.unsolved, k)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def keep_for_interval(s: Store, f: int, at_new: bool) -> None:
     """Keep the DVL reading in row f for the interval that it begins or lies in; straight lines end on it as well."""
     w = s.w[0]
@@ -479,7 +479,7 @@ def keep_for_interval(s: Store, f: int, at_new: bool) -> None:
         last.dvl = f
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_displacement(s: Store, imu: NDArray[Any], b_g: Array) -> None:
     """Add the preintegrated-DVL factor of the newest interval, or its readings one by one where the DVL was silent.
 
@@ -538,7 +538,7 @@ def add_displacement(s: Store, imu: NDArray[Any], b_g: Array) -> None:
 # --- solving ---------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def update(s: Store, to_optimum: bool) -> int:
     """Solve with what is new: one Gauss–Newton step, and as many more as are asked for while anything moves."""
     w = s.w[0]
@@ -560,7 +560,7 @@ def update(s: Store, to_optimum: bool) -> int:
     return NOT_CONVERGED if to_optimum else DONE
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def solve(s: Store, first: int, reach: int) -> bool:
     """Factor anew from keyframe `first` on, and find the increments of it and of `reach` keyframes at least."""
     w = s.w[0]
@@ -583,7 +583,7 @@ def solve(s: Store, first: int, reach: int) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tie(s: Store, k: int) -> bool:
     """Eliminate keyframe k: what it says of the next one, with the factors of both, and what that says of it."""
     node, ahead, P_ji = s.nodes[slot(s, k)], s.nodes[slot(s, k + 1)], np.empty((DIM, DIM))
@@ -601,7 +601,7 @@ def tie(s: Store, k: int) -> bool:
     return divide_into(P_j, P_ji, node.Gt)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def linearise(s: Store, exact: bool) -> int:
     """Linearise what is new, and anew the keyframes that have moved beyond the thresholds, or, `exact`, at all.
 
@@ -656,7 +656,7 @@ def linearise(s: Store, exact: bool) -> int:
     return first
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def forget(s: Store) -> None:
     """Marginalise the oldest keyframe out: what it said of the next one is there already."""
     w = s.w[0]
@@ -673,7 +673,7 @@ def forget(s: Store) -> None:
 # --- what is said ----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def weigh(s: Store, reading: NDArray[Any], state: NDArray[Any]) -> None:
     """Give a reading the noise that its loss leaves it with at a predicted state (a STATE record)."""
     w, one = s.w[0], reading[0]
@@ -689,7 +689,7 @@ def weigh(s: Store, reading: NDArray[Any], state: NDArray[Any]) -> None:
             one.sigma[i] = one.sigma[i] / np.sqrt(weight) if weight > 0.0 else np.inf
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def leave(s: Store, until: int, swept: bool) -> None:
     """Write down the ticks from the oldest keyframe on, up to `until`, as they are seen now.
 
@@ -721,7 +721,7 @@ def leave(s: Store, until: int, swept: bool) -> None:
                 carry_on(s, k, x, t_ns)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def carry_on(s: Store, k: int, x: NDArray[Any], t_ns: int) -> None:
     """Carry a belief at keyframe k, a STATE record, on to t_ns."""
     w, node = s.w[0], s.nodes[slot(s, k)]
@@ -734,7 +734,7 @@ def carry_on(s: Store, k: int, x: NDArray[Any], t_ns: int) -> None:
     x[0].P[:] = sandwich(F, x[0].P) + Q
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def count_outliers(s: Store, k: int) -> None:
     """Count the factors on a keyframe that end beyond the width of their loss."""
     w, node, ahead = s.w[0], s.nodes[slot(s, k)], s.nodes[slot(s, k + 1)]
