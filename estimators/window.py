@@ -6,7 +6,6 @@ time is compiled (`window_steps`); here is what allocates, and what talks to Pyt
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..datasets.epochs import IMU_SAMPLE, READING, SENSOR, Epoch
 from ..datasets.rig import Rig
-from ..datasets.state import Array, Belief
+from ..datasets.state import Belief
 from ..datasets.trajectory import Trajectory
 from .dvl_preintegration import DISPLACEMENT
 from .graph_pass import LONGEST_SILENCE_S, GraphSmoother
@@ -44,7 +43,7 @@ from .window_steps import (
     drive,
 )
 
-HARDLY_ANY_NS = 1 << 62
+NEVER_NS = 1 << 62
 NO_IMU, NO_READINGS = np.zeros(0, IMU_SAMPLE), np.zeros(0, READING)
 
 
@@ -205,7 +204,7 @@ def _tell(w: Any, config: GraphSmoother, solving: Solving) -> None:
     w["window_ns"], w["merge_ns"] = config.window_s * 1e9, config.merge_ns
     w["period_ns"], w["timeout_ns"] = config.period_s * 1e9, config.keyframe_timeout_s * 1e9
     w["silence_ns"], w["hold_ns"] = int((config.period_s + LONGEST_SILENCE_S) * 1e9), config.max_hold_s * 1e9
-    w["covariance_ns"] = int(min(config.hindsight_covariance_s * 1e9, HARDLY_ANY_NS))
+    w["covariance_ns"] = int(min(config.hindsight_covariance_s * 1e9, NEVER_NS))
     w["preintegrates"], w["velocity"] = config.preintegrates, "velocity" in config.dvl
     w["tight"], w["straight"] = "preintegrated-tight" in config.dvl, config.dvl_between == "straight"
     rotation, position, velocity, bias = solving.relinearize

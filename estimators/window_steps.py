@@ -9,7 +9,7 @@ flat, and what is long is called from one place.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -19,7 +19,7 @@ from ..datasets.epochs import DEPTH, DVL, HEADING
 from ..datasets.state import DIM, Array, TimeArray
 from .dvl_preintegration import given_rotation, preintegrate_dvl
 from .eskf import correct, inject, propagate
-from .imu import BLOCK, STATE, integrate, predict, process_noise, sandwich
+from .imu import BLOCK, integrate, predict, process_noise, sandwich
 from .innovation import normalised_square
 from .measurements import measure
 from .window_chain import (
@@ -107,6 +107,10 @@ NODES, FACTORS, SAMPLES, PENDING, TICKS, OUT = 1, 2, 4, 8, 16, 32
 """What a Store can be short of."""
 
 
+Records: TypeAlias = Any
+"""An array, mostly of records; NumPy's types know nothing of their fields."""
+
+
 class Store(NamedTuple):
     """All that a pass holds.
 
@@ -123,22 +127,22 @@ class Store(NamedTuple):
         rig: RIG record.
     """
 
-    w: NDArray[Any]
-    nodes: NDArray[Any]
-    points: NDArray[Any]
-    blocks: NDArray[Any]
-    anchor: NDArray[Any]
-    mean: NDArray[Any]
-    factors: NDArray[Any]
-    readings: NDArray[Any]
-    carries: NDArray[Any]
-    displacements: NDArray[Any]
-    imu: NDArray[Any]
-    pending: NDArray[Any]
-    ticks: TimeArray
-    out: NDArray[Any]
-    out_ns: TimeArray
-    rig: NDArray[Any]
+    w: Records
+    nodes: Records
+    points: Records
+    blocks: Records
+    anchor: Records
+    mean: Records
+    factors: Records
+    readings: Records
+    carries: Records
+    displacements: Records
+    imu: Records
+    pending: Records
+    ticks: Records
+    out: Records
+    out_ns: Records
+    rig: Records
 
 
 @njit(cache=True, error_model="numpy")
@@ -244,7 +248,7 @@ def lacks(s: Store, n_imu: int, n_readings: int, t_ns: int) -> int:
 
 @njit(cache=True, error_model="numpy")
 def believe(s: Store, out: NDArray[Any]) -> int:
-    """Fill `out`, a STATE record, with the belief at this moment: the newest keyframe's, carried on as a filter would."""
+    """Fill `out`, a STATE record, with the belief now: the newest keyframe's, carried on as a filter would."""
     w = s.w[0]
     a = slot(s, w.newest)
     node = s.nodes[a]
@@ -448,7 +452,7 @@ def add_reading(s: Store, k: int, f: int) -> None:
     w = s.w[0]
     node, factor, reading = s.nodes[slot(s, k)], s.factors[f], s.readings[f]
     kind, n = reading.kind, 0
-    for i in range(1 if kind == DEPTH or kind == HEADING else 3):
+    for i in range(1 if kind in (DEPTH, HEADING) else 3):
         n += np.isfinite(reading.sigma[i])
     factor.kind, factor.loss, factor.width, factor.fresh = kind, w.loss[kind], w.width[kind, n], 1
     if abs(reading.t_ns - node.t_ns) <= w.merge_ns:
@@ -544,20 +548,22 @@ def update(s: Store, to_optimum: bool) -> int:
     w = s.w[0]
     if to_optimum:
         w.unsolved = w.head
+    settled = False
     for _ in range(MOST_ITERATIONS if to_optimum else w.extra_updates + 1):
         first = linearise(s, to_optimum)
         if first < w.head:
             return NOT_POSITIVE
         if first > w.newest:
-            return DONE
+            settled = True
+            break
         if not solve(s, first, w.newest if to_optimum else w.reach):
             return NOT_POSITIVE
         w.unsolved = w.newest + 1
-    newest = s.points[slot(s, w.newest)]
+    a = slot(s, w.newest)
     for k in range(3):
-        if not np.isfinite(newest.p_WB_W[k] + s.nodes[slot(s, w.newest)].d[3 + k]):
+        if not np.isfinite(s.points[a].p_WB_W[k] + s.nodes[a].d[3 + k]):
             return NOT_FINITE
-    return NOT_CONVERGED if to_optimum else DONE
+    return DONE if settled or not to_optimum else NOT_CONVERGED
 
 
 @njit(cache=True, error_model="numpy")
