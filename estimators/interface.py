@@ -50,13 +50,12 @@ class Diverged(RuntimeError):  # noqa: N818 - the run's status, by its name
 
 
 class Pass(Protocol):
-    """One pass over one log, driven in time order; it sees neither the truth nor the future.
+    """One pass over one log, driven in time order; it sees neither the truth nor the future."""
 
-    Attributes:
-        counts: what happened to readings and solvers, by name (readings used, late, merged, ...).
-    """
-
-    counts: dict[str, int]
+    @property
+    def counts(self) -> dict[str, int]:
+        """What happened to readings and solvers, by name (readings used, late, merged, ...)."""
+        ...
 
     def step(self, epoch: Epoch) -> None:
         """Take in the IMU block up to epoch.t_ns, then the readings received there.

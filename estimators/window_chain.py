@@ -7,11 +7,11 @@ the covariance form, in which the strong tie is a small addend and nothing cance
 
     δ_j = F δ_i + c + noise of covariance Q                                   a tie from keyframe i to the next, j
     N(m, P)              of δ_i, given all that is older and i's own rows
-    N(m_ahead, P_ahead)  of δ_j, given the same and the rows of both
-    G = cov(δ_i, δ_j) P_ahead⁻¹                       d_i = m + G (d_j − m_ahead)          the back-substitution
+    N(m_given, P_given)  of δ_j, given the same and the rows of both
+    G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back-substitution
 
 It is the elimination that Rauch, Tung & Striebel (doi:10.2514/3.3166) wrote down first. What a state that has left knew
-is then (m_ahead, P_ahead) of the next one: marginalising costs nothing. A row is r + H δ (+ H_j δ_j), of unit variance.
+is then (m_given, P_given) of the next one: marginalising costs nothing. A row is r + H δ (+ H_j δ_j), of unit variance.
 
 Inner loops run along rows of fixed length, so that they compile to vector instructions.
 """
@@ -29,14 +29,10 @@ from ..datasets.state import DIM, Array
 
 NODE = np.dtype(
     [
-        ("F", "f8", (DIM, DIM)),  # the tie to the next keyframe
-        ("Q", "f8", (DIM, DIM)),
-        ("c", "f8", (DIM,)),
-        ("m_given", "f8", (DIM,)),  # what all that is older says of it
-        ("P_given", "f8", (DIM, DIM)),
-        ("m", "f8", (DIM,)),  # with its own rows
-        ("P", "f8", (DIM, DIM)),
+        # what a back-substitution reads lies together
         ("Gt", "f8", (DIM, DIM)),  # Gᵀ
+        ("m", "f8", (DIM,)),  # what all that is older, and its own rows, say of it
+        ("m_given", "f8", (DIM,)),  # what all that is older says of it
         ("d", "f8", (DIM,)),  # with all there is: the increment
         ("t_ns", "i8"),
         ("next_ns", "i8"),  # of the next keyframe; 0 where there is none
@@ -45,6 +41,11 @@ NODE = np.dtype(
         ("first", "i8"),  # of its factors; -1 for none
         ("dvl", "i8"),  # first of the DVL readings kept for its interval; -1 for none
         ("moved", "i8"),  # linearised anew in this update
+        ("P", "f8", (DIM, DIM)),  # as m
+        ("P_given", "f8", (DIM, DIM)),  # as m_given
+        ("F", "f8", (DIM, DIM)),  # the tie to the next keyframe
+        ("Q", "f8", (DIM, DIM)),
+        ("c", "f8", (DIM,)),
     ]
 )
 """Nodes lie in a ring whose length is a power of two: keyframe k in slot k & (length − 1)."""

@@ -282,7 +282,7 @@ def believe(s: Store, out: NDArray[Any]) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def in_order(readings: NDArray[Any]) -> TimeArray:
+def in_order(readings: Records) -> TimeArray:
     """Return the rows in the order of their truth; those of one moment stay as they are."""
     order = np.arange(len(readings))
     for i in range(1, len(order)):
@@ -295,10 +295,11 @@ def in_order(readings: NDArray[Any]) -> TimeArray:
 
 
 @njit(cache=True, error_model="numpy")
-def receive(s: Store, readings: NDArray[Any]) -> NDArray[Any]:
+def receive(s: Store, readings: Records) -> Records:
     """Put every reading of an epoch where it belongs; return those that may call for keyframes."""
     w, order = s.w[0], in_order(readings)
-    calls, n = np.empty(len(order), readings.dtype), 0
+    calls: Records = np.empty(len(order), readings.dtype)
+    n = 0
     for m in order:
         reading = readings[m]
         kind, measured = reading.kind, 0
@@ -499,7 +500,7 @@ def add_displacement(s: Store, imu: NDArray[Any], b_g: Array) -> None:
     while f >= 0:
         n, f = n + 1, s.factors[f].next
     rows, f = np.empty(n, np.int64), last.dvl
-    readings = np.empty(n, s.readings.dtype)
+    readings: Records = np.empty(n, s.readings.dtype)
     for m in range(n - 1, -1, -1):
         rows[m], readings[m], f = f, s.readings[f], s.factors[f].next
     last.dvl = -1
