@@ -76,10 +76,13 @@ def to_the_last_digit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def assert_one(ours: Result, theirs: Result, tolerance_m: float = 1e-3) -> None:
-    """Positions to a millimetre, attitudes to 0.1 mrad, standard deviations to 1 % and counts to the last one."""
+    """Positions to a millimetre, attitudes to 0.1 mrad, standard deviations to 1 %, and counts to the last one.
+
+    Outliers to two: ours are counted when a keyframe has seen the one that makes it leave, theirs just before.
+    """
     assert ours.status == theirs.status == "done", (ours.cause, theirs.cause)
     for name, n in theirs.counts.items():
-        assert ours.counts[name] == pytest.approx(n, abs=1 if name.startswith("outliers") else 0), name
+        assert ours.counts[name] == pytest.approx(n, abs=2 if name.startswith("outliers") else 0), name
     for a, b in ((ours.online, theirs.online), (ours.smoothed, theirs.smoothed)):
         assert np.array_equal(a.t_ns, b.t_ns)
         assert np.linalg.norm(a.p_WB_W - b.p_WB_W, axis=1).max() < tolerance_m
@@ -111,15 +114,24 @@ def test_at_a_lag_it_reaches_gtsams_optimum(dvl: str) -> None:
         ({}, {"keyframe_period_s": 1.0}),
         (LATE, {}),
         (ODD, {}),
-        ({}, {"robust": LOSS_BY_SENSOR}),
+        ({}, {"robust": dict.fromkeys(["gps", "depth", "dvl"], "huber")}),
     ],
     ids=["lawnmower", "yo-yo", "yo-yo at 10 s", "tight and velocity", "sparse", "late", "odd", "robust"],
 )
 def test_at_a_lag_it_reaches_gtsams_optimum_whatever_it_is_given(change: dict, options: dict) -> None:
-    """Under a loss to 2 mm: the two freeze its weights, where a keyframe leaves, at iterates that are not quite one."""
     log = simulate(replace(SHORT, duration_s=30.0, **change), seed=3)
-    ours, theirs = run_log(log, create("window", **TO_OPTIMUM, **options)), run_log(log, create("fls-batch", **options))
-    assert_one(ours, theirs, 2e-3 if "robust" in options else 1e-3)
+    assert_one(run_log(log, create("window", **TO_OPTIMUM, **options)), run_log(log, create("fls-batch", **options)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "tukey"])
+def test_with_a_doubted_heading_it_is_isam2_with_nothing_put_off(loss: str) -> None:
+    """To 2 mm: iSAM2 lets a state go one step before its optimum. GTSAM's batch lag is no oracle here: at the fourth
+    second of this log its damped steps end 0.5 mrad from both of them, a step later they are together again.
+    """  # fmt: skip
+    log = simulate(SHORT, seed=3)
+    options = {"robust": {"gps": loss, "heading": loss}, "relinearize": [0.0] * 4, "extra_updates": 8}
+    assert_one(run_log(log, create("window", **options)), run_log(log, create("fls", wildfire=0.0, **options)), 2e-3)
 
 
 @pytest.mark.usefixtures("to_the_last_digit")
