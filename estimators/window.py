@@ -86,7 +86,7 @@ class WindowPass:
             w, np.zeros(16, NODE), np.zeros(16, STATE), np.zeros(16, BLOCK), anchor, np.zeros(15), np.zeros(0, FACTOR),
             np.zeros(0, READING), np.zeros(0, BLOCK), np.zeros(0, DISPLACEMENT), np.zeros(256, IMU_SAMPLE),
             np.zeros(16, READING), np.zeros(16, np.int64), np.zeros(16, STATE), np.zeros(16, np.int64),
-            compile_rig(rig, config.factors, config.inflate),
+            compile_rig(rig, config.factors, config.inflate, config.earth_rotation),
         )  # fmt: skip
         self._make_room(FACTORS)
         node = self._store.nodes[:1]
@@ -98,7 +98,8 @@ class WindowPass:
     def counts(self) -> dict[str, int]:
         """See `Pass.counts`; keyframes linearised anew, and blocks factored, are `relinearised` and `refactored`."""
         w = self._store.w[0]
-        names = "keyframes", "carried", "merged", "late", "late_used", "preintegrated", "relinearised", "refactored"
+        names = ("keyframes", "carried", "merged", "late", "late_used", "preintegrated", "not_summed")
+        names += ("relinearised", "refactored")
         counts = Counter({name: int(w[name]) for name in names})
         for kind, sensor in enumerate(SENSOR):
             if sensor in self._counted:

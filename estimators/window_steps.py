@@ -19,7 +19,7 @@ from ..datasets.epochs import DEPTH, DVL, HEADING
 from ..datasets.state import DIM, Array, TimeArray
 from .dvl_preintegration import given_rotation, preintegrate_dvl
 from .eskf import correct, inject, propagate
-from .imu import BLOCK, integrate, predict, process_noise, sandwich
+from .imu import BLOCK, integrate, over_world, predict, process_noise, sandwich
 from .innovation import normalised_square
 from .measurements import measure
 from .window_chain import (
@@ -98,6 +98,7 @@ WINDOW = np.dtype(
         ("late", "i8"),
         ("late_used", "i8"),
         ("preintegrated", "i8"),
+        ("not_summed", "i8"),
         ("relinearised", "i8"),
         ("refactored", "i8"),
         ("outliers", "i8", (5,)),
@@ -381,7 +382,8 @@ def make_keyframe(s: Store, t_ns: int) -> int:
         else:
             add_reading(s, j if at_new else i, f)
     if w.preintegrates and last.dvl >= 0:
-        add_displacement(s, imu, x[0].b_g.copy())
+        b_g = x[0].b_g.copy()
+        add_displacement(s, over_world(imu, x[0].R_WB, b_g, s.rig), b_g)
 
     # a state of just the window's age stays, for it has yet to see the new one; half a millisecond for rounding
     stays, horizon_ns = w.head, t_ns - (w.window_ns + 5e5)
@@ -519,6 +521,7 @@ def add_displacement(s: Store, imu: NDArray[Any], b_g: Array) -> None:
         f = rows[m]
         s.factors[f].next = -1
         if not summed and readings[m].t_ns < new_ns - w.merge_ns:
+            w.not_summed += 1
             add_reading(s, i, f)
         elif not summed or m > 0:
             give_back(s, f)

@@ -319,6 +319,8 @@ def apart(log: Log, a: str, b: str, output: str = "online", **options: object) -
         ("fls", {"keyframe_period_s": 2.0}),  # readings and ticks between keyframes are carried
         ("fls-batch", {}),
         ("batch", {}),
+        ("window", {}),
+        ("window", {"keyframe_period_s": 2.0}),
     ],
     ids=str,
 )
@@ -331,14 +333,15 @@ def test_with_hindsight_too(spun: Log, options: dict[str, float]) -> None:
     assert apart(spun, "batch", "rts", "hindsight", **options) < 0.1
 
 
+@pytest.mark.parametrize("name", ["fls", "window"])
 @pytest.mark.parametrize("dvl", ["velocity", "preintegrated-loose", "preintegrated-tight"])
-def test_a_smoother_at_long_intervals_stays_at_the_truth(dvl: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_smoother_at_long_intervals_stays_at_the_truth(name: str, dvl: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without noise, on an Earth that turns a hundred times too fast, by DVL and depth alone."""
     monkeypatch.setattr(rig_module, "EARTH_RATE_RADPS", 100 * rig_module.EARTH_RATE_RADPS)
     scenario = Scenario(duration_s=60.0, imu="navigation", latitude_deg=50.0, noise_scale=0.0, **SMALL)
     log = simulate(scenario, seed=3)
     options = {"dvl": [dvl], "dvl_between": "straight", "keyframe_period_s": 1.0, "factors": ["dvl", "depth"]}
-    truth, online = associate(log.truth, run_log(log, create("fls", **options, **OPTION)).online)
+    truth, online = associate(log.truth, run_log(log, create(name, **options, **OPTION)).online)
     error, sigma = error_state(truth, online), np.sqrt(online.P.diagonal(axis1=1, axis2=2))
     assert np.abs(error[:, 3:6]).max() < 0.03
     assert np.abs(error / sigma).max() < 1.0
