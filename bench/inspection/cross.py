@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 from ...datasets.log import Log
 from .answers import Answer
 from .clock import clock_check
@@ -20,6 +23,8 @@ def cross_checks(log: Log) -> list[Check]:
     from what the description says beyond chance and by a size that matters. What to put into log.yaml comes on top of
     what stands there: offsets and delays add, scales multiply.
     """
+    silent: dict[str, Any] = {name: None for name, stream in log.streams.items() if not len(stream)}
+    log = replace(log, **silent)  # a sensor that never spoke is none
     imu = inertial_of(log)
     answers: list[Answer | None] = []
     if log.dvl is None:

@@ -102,8 +102,10 @@ def least_squares(columns: dict[str, Array], y: Array, block: Index) -> Fit | No
         block: (n,) which stretch a row belongs to, from 0.
 
     Returns:
-        None where fewer than `FEWEST_BLOCKS` stretches hold data, or the columns are not finite.
+        None where fewer than `FEWEST_BLOCKS` stretches hold data, or the columns are not finite, or there are none.
     """
+    if not columns:
+        return None
     X = np.stack(list(columns.values()), axis=1)
     if not (np.isfinite(X).all() and np.isfinite(y).all()):
         return None

@@ -70,12 +70,18 @@ def _at_rest(channel: Channel, densities: Array, stated: float) -> list[Finding]
     largest = float(densities.max())
     if not np.isfinite(largest) or largest == 0 or stated / OFF <= largest <= stated * OFF:
         return []
-    how = f"{largest / stated:.1f} times" if largest > stated else f"1/{stated / largest:.3g} of"
     says = (
-        f"At rest the {channel.name}'s white noise is {largest:.2g} {UNIT[channel.name]} on its worst axis, {how} "
-        f"what is stated ({stated:.2g})."
+        f"At rest the {channel.name}'s white noise is {largest:.2g} {UNIT[channel.name]} on its worst axis, "
+        f"{_beside(largest, stated)}."
     )
     return [Finding("imu", says, f"streams.imu.noise.{channel.name}_density: {largest:.2g}")]
+
+
+def _beside(found: float, stated: float) -> str:
+    if stated == 0:
+        return "where none is stated"
+    how = f"{found / stated:.1f} times" if found > stated else f"1/{stated / found:.3g} of"
+    return f"{how} what is stated ({stated:.2g})"
 
 
 def _bound(curve: AllanCurve, period_s: float) -> Array:
@@ -94,14 +100,14 @@ def _under_way(channel: Channel, densities: Array, bound: Array, stated: float) 
     if largest > OFF * stated:
         says = (
             f"From sample to sample the {channel.name} scatters like white noise of {largest:.2g} {unit}, "
-            f"{largest / stated:.1f} times what is stated ({stated:.2g}): noise, or shaking that a filter must take "
-            "for it."
+            f"{_beside(largest, stated)}: noise, or shaking that a filter must take for it."
         )
         return [Finding("imu", says, f"streams.imu.noise.{channel.name}_density: {largest:.2g}")]
     if 0 < max(most, largest) < stated / OFF:
+        most = most or largest
         says = (
             f"Even with all motion in it, the {channel.name} varies no more than white noise of {most:.2g} {unit} "
-            f"does, 1/{stated / most:.3g} of what is stated ({stated:.2g})."
+            f"does, {_beside(most, stated)}."
         )
         return [
             Finding("imu", says, f"streams.imu.noise.{channel.name}_density: {most:.2g}, unless it is large on purpose")

@@ -60,9 +60,10 @@ class Inertial:
         return np.cumsum(rate * self.dt_s, dtype=np.float64)
 
     def level(self, t_s: Array) -> Array:
-        """Return R (k, 3, 3) from L to the level frame of yaw zero, at t_s (k,)."""
+        """Return R (k, 3, 3) from L to the level frame of yaw zero, at t_s (k,); z is up where no force tells."""
         up = np.stack([np.interp(t_s, self.t_s, self.up_L[:, i]) for i in range(3)], axis=1)
-        up /= np.linalg.norm(up, axis=1, keepdims=True)
+        size = np.linalg.norm(up, axis=1, keepdims=True)
+        up = np.where(size > 1e-6, up / np.maximum(size, 1e-6), np.array([0.0, 0.0, 1.0]))
         x = np.array([1.0, 0.0, 0.0]) - up * up[:, :1]
         x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-6)
         return np.stack([x, np.cross(up, x), up], axis=1)

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ...datasets.errors import DatasetError
 from ...datasets.log import Log
 from ...datasets.opening import RecordingNotFound, open_log
@@ -29,6 +31,8 @@ SINGLE = (
     check_imu_noise,
     check_noise,
 )
+LARGEST = 1e30
+"""No reading is as large, whatever its unit."""
 REPAIRED = re.compile(r"^(\w+): (\d+) rows (.+) \(repair\) dropped$")
 MENDS = {
     "out of order": "streams.{}.time.column: the one that runs evenly; else drop those rows in the file",
@@ -57,12 +61,39 @@ def open_to_inspect(name: str | Path, data: Path | None = None) -> tuple[Log, tu
         DatasetError: it does not open even so.
     """
     try:
-        return open_log(name, data), ()
+        log, repairs = open_log(name, data), ()
     except RecordingNotFound:
         raise
     except DatasetError:
         log = open_log(name, data, repair=True)
-        return log, tuple(note for note in log.notes if REPAIRED.match(note))
+        repairs = tuple(note for note in log.notes if REPAIRED.match(note))
+    _check_sizes(name, log)
+    return log, repairs
+
+
+def _check_sizes(name: str | Path, log: Log) -> None:
+    """Refuse numbers whose squares no sum can hold, and sigmas whose inverse is one.
+
+    Raises:
+        DatasetError: names the stream, the row and the number.
+    """
+    held = {"imu": [log.imu.w_WI_I, log.imu.f_I], **{k: [s.z, s.sigma] for k, s in log.streams.items()}}
+    if log.truth is not None:
+        held[log.truth_kind] = [log.truth.p_WB_W]
+    stated = {f"streams.imu.noise.{name}": value for name, value in vars(log.rig.imu_noise).items()}
+    stated |= {f"streams.{k}: sigma": float(s.sigma.min(initial=np.inf)) for k, s in log.streams.items()}
+    for where, value in stated.items():
+        if LARGEST < value < np.inf or 0 < value < 1 / LARGEST:
+            raise DatasetError(f"{name}: {where} is {value:.3g}, which is no sensor's; check it, and its unit")
+    for stream, arrays in held.items():
+        for values in arrays:
+            beyond = np.argwhere(np.isfinite(values) & (np.abs(values) > LARGEST))
+            if len(beyond):
+                row, value = int(beyond[0, 0]), values[tuple(beyond[0])]
+                raise DatasetError(
+                    f"{name}: {stream}: row {row} ({len(beyond)} numbers in all) holds {value:.3g}, which nothing "
+                    "measures; check its column, or bound it (`outliers`, `valid`)"
+                )
 
 
 def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Inspection:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
+from warnings import catch_warnings, filterwarnings
 
 from ...datasets.errors import DatasetError
 from ..drawing import empty_figure
@@ -69,7 +70,8 @@ def draw_inspection(inspection: Inspection) -> Figure:
     said = (
         "nothing looks wrong" if not count else f"{count} things look wrong" if count > 1 else "one thing looks wrong"
     )
-    figure.suptitle(f"{log.name}, {log.duration_s:.0f} s: {said}", fontsize=11)
+    name = "".join(letter if letter.isprintable() else " " for letter in log.name)
+    figure.suptitle(f"{name}, {log.duration_s:.0f} s: {said}", fontsize=11, parse_math=False)
     return figure
 
 
@@ -100,6 +102,8 @@ def save_page(inspection: Inspection, file: Path) -> None:
     undated = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(file.suffix.lower(), {})
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        draw_inspection(inspection).savefig(file, dpi=130, metadata=undated)
+        with catch_warnings():  # a name in letters that the font has not is shown as boxes
+            filterwarnings("ignore", message="Glyph", category=UserWarning)
+            draw_inspection(inspection).savefig(file, dpi=130, metadata=undated)
     except OSError as error:
         raise DatasetError(f"{file}: cannot be written ({error.strerror}); choose another place by -o") from None

@@ -152,7 +152,10 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
             return without_trend(x, t_s, window, 0)
 
         x = x_at()
-        z = complex(np.vdot(x, p) / max(np.vdot(x, x).real, 1e-12))
+        squares = float(np.vdot(x, x).real)
+        if squares < 1e-12:  # by the DVL it never moved
+            return None, 0j
+        z = complex(np.vdot(x, p) / squares)
         columns: dict[str, Plane] = {"scale": z * x, "turn": 1j * z * x}
         columns["delay"] = z * (x_at(shift=0.1) - x_at(shift=-0.1)) / 0.2
         columns["dvl"] = z * (x_at(dvl=0.1) - x_at(dvl=-0.1)) / 0.2

@@ -674,6 +674,83 @@ def test_a_lone_imu_is_inspected() -> None:
     assert inspect_log(alone).findings == ()
 
 
+def of_stream(stream: ReadingStream, rows: Any = slice(None), z: float = 1.0, sigma: float = 1.0) -> ReadingStream:
+    """Some rows of a stream, its readings and sigmas multiplied."""
+    return type(stream)(
+        stream.t_ns[rows], stream.received_ns[rows], stream.z[rows] * z, np.maximum(stream.sigma[rows] * sigma, 1e-320)
+    )
+
+
+def odd(what: str, log: Log) -> Log:
+    """A log that no vehicle wrote, but somebody's converter did."""
+    imu = log.imu
+    changed: dict[str, Any] = {
+        "no force": {"imu": ImuStream(imu.t_ns, imu.w_WI_I, np.zeros_like(imu.f_I))},
+        "nothing moves": {"imu": ImuStream(imu.t_ns, imu.w_WI_I * 0, imu.f_I * 0)}
+        | {name: of_stream(stream, z=0.0) for name, stream in log.streams.items()},
+        "dvl measures nothing": {"dvl": of_stream(log.streams["dvl"], sigma=np.inf)},
+        "dvl in a wrong unit": {"dvl": of_stream(log.streams["dvl"], z=1e-10)},
+        "heading never spoke": {"heading": of_stream(log.streams["heading"], slice(0))},
+        "no accel noise": {"rig": with_noise(log.rig, accel_density=0.0)},
+        "no gyro noise": {"rig": with_noise(log.rig, gyro_density=0.0)},
+        "truth without attitude": {
+            "truth": dataclasses.replace(log.truth, R_WB=np.full_like(log.truth.R_WB, np.nan)) if log.truth else None
+        },
+    }[what]
+    return dataclasses.replace(log, **changed)
+
+
+def with_noise(rig: Rig, **densities: float) -> Rig:
+    return dataclasses.replace(rig, imu_noise=dataclasses.replace(rig.imu_noise, **densities))
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "no force",
+        "nothing moves",
+        "dvl measures nothing",
+        "dvl in a wrong unit",
+        "heading never spoke",
+        "no accel noise",
+        "no gyro noise",
+        "truth without attitude",
+    ],
+)
+def test_odd_logs_are_inspected_and_drawn(what: str) -> None:
+    inspection = inspect_log(odd(what, simulated()))
+    draw_inspection(inspection).canvas.draw()
+
+
+def test_noise_where_none_is_stated_is_told() -> None:
+    log = simulated(imu="consumer")
+    found = inspect_log(dataclasses.replace(log, rig=with_noise(log.rig, gyro_density=0.0))).findings
+    assert "where none is stated" in said(found, "imu", "white noise").says
+
+
+@pytest.mark.parametrize("factor", [1e40, 1e200])
+@pytest.mark.parametrize("what", ["imu", "depth", "sigma", "density"])
+def test_numbers_that_nothing_measures_are_one_line_and_exit_2(what: str, factor: float, tmp_path: Path) -> None:
+    log = simulated()
+    depth = log.streams["depth"]
+    changed: dict[str, dict[str, Any]] = {
+        "imu": {"imu": ImuStream(log.imu.t_ns, log.imu.w_WI_I * factor, log.imu.f_I)},
+        "depth": {"depth": of_stream(depth, z=factor)},
+        "sigma": {"depth": of_stream(depth, sigma=1 / factor)},
+        "density": {"rig": with_noise(log.rig, gyro_density=factor)},
+    }
+    folder = write_folder(dataclasses.replace(log, **changed[what]), tmp_path / "log")
+    code, out, err = call(folder)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert ("nothing measures" in err) or ("no sensor's" in err)
+
+
+def test_any_name_can_stand_over_the_page(tmp_path: Path) -> None:
+    folder = write_folder(dataclasses.replace(simulated(), name="潜水 $x_{ \a [red]"), tmp_path / "log")
+    assert call(folder, "-o", tmp_path / "page.png")[0] == 0
+
+
 def call(*arguments: object) -> tuple[int, str, str]:
     result = CliRunner().invoke(app, ["inspect", *map(str, arguments)])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
