@@ -157,6 +157,8 @@ def read_rows(connection: sqlite3.Connection) -> pd.DataFrame:
     """Return the rows of an open store; columns that an older version did not know are empty."""
     there = _columns(connection)
     known = [name for name in COLUMNS if name in there]
+    if not known:
+        raise sqlite3.DatabaseError("no table `runs` in it")
     cursor = connection.execute(f"SELECT {', '.join(known)} FROM runs ORDER BY rowid")
     table = pd.DataFrame(cursor.fetchall(), columns=known).reindex(columns=list(COLUMNS))
     numbers = [name for name, kind in COLUMNS.items() if kind == "REAL"]
@@ -167,13 +169,16 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
     """Return the rows of the experiment in `folder`, read only.
 
     Raises:
-        ExperimentError: no store there.
+        ExperimentError: no store there, or it cannot be read.
     """
     path = Path(folder) / "runs.sqlite"
     if not path.is_file():
         raise ExperimentError(f"{path}: no such file; `fathom run` makes it")
-    with closing(sqlite3.connect(path)) as connection:
-        return read_rows(connection)
+    try:
+        with closing(sqlite3.connect(path)) as connection:
+            return read_rows(connection)
+    except sqlite3.Error as error:
+        raise ExperimentError(f"{path}: cannot be read as a store of runs ({error})") from None
 
 
 @cache

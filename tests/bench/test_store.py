@@ -121,3 +121,11 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_provenance_names_commit_versions_and_machine() -> None:
     assert set(provenance()) == {"commit_id", "versions", "machine"}
     assert set(provenance()) <= set(COLUMNS)
+
+
+def test_what_is_no_store_is_said_plainly(tmp_path: Path) -> None:
+    file = tmp_path / "runs.sqlite"
+    for content in (b"", b"no database, but long enough to be read as one " * 9):
+        file.write_bytes(content)
+        with pytest.raises(ExperimentError, match="cannot be read as a store"):
+            load_runs(tmp_path)
