@@ -104,15 +104,17 @@ def run(
 
 
 def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
-    """Write the CSV files and the figures of all that was ever run of this plan, and print the tables of these rows."""
+    """Write the CSV files and the figures of all that was run of this plan, and print the tables of these rows."""
     from .experiment import ExperimentError
     from .figures import draw_figures
     from .paired import paired
-    from .runner import rows_of
+    from .runner import outdated, rows_of
     from .store import load_runs
     from .table import print_table, write_consistency, write_paired, write_table
 
     every = rows_of(load_runs(folder), plan.runs())
+    old = outdated(every, plan) & ~every["identity"].isin(rows["identity"])
+    every = every.loc[~old]
     differences = paired(every, plan.comparisons(), plan.compare)
     try:
         write_table(every, folder / "table.csv")
@@ -129,6 +131,8 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
         _say(f"{standing} runs were done already; --force does them again")
     if renewed:
         _say(f"{renewed} runs were done under another spec, log or version, and made anew")
+    if old.any():
+        _say(f"{old.sum()} rows of another spec or version are left out of the files; without --only they are renewed")
     for log, cause in rows.attrs["kept"].items():
         _say(f"{log}: {cause}; its rows are from an earlier run")
 

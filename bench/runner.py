@@ -235,6 +235,22 @@ def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
 
 # -- in the parent: workers and what becomes of them ------------------------------------------------------------------
 
+def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
+    """Return which of the rows `rows_of` gave were made under another spec or version than a run today would be."""
+    runs = {(run.log.name, run.estimator.label, run.seed): run for run in experiment.runs()}
+    versions = json.loads(provenance()["versions"])
+
+    def is_old(row: Any) -> bool:
+        if not isinstance(row.spec, str) or not isinstance(row.versions, str):
+            return True
+        spec, seed = json.loads(row.spec), None if pd.isna(row.seed) else int(row.seed)
+        today = experiment.spec(runs[row.log, row.label, seed], spec.get("repair", False))
+        as_text = [json.dumps(one, sort_keys=True) for one in (spec, today)]
+        return as_text[0] != as_text[1] or json.loads(row.versions) != versions
+
+    return pd.Series([is_old(row) for row in rows.itertuples()], index=rows.index, dtype=bool)
+
+
 
 @dataclass
 class Worker:

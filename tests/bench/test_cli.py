@@ -84,6 +84,15 @@ def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(
     assert "its rows are from an earlier run" in err
 
 
+def test_only_after_a_change_leaves_what_is_outdated_out_of_the_csv(tmp_path: Path) -> None:
+    assert call("run", write(tmp_path), "--out", tmp_path, "--jobs", 2)[0] == 0
+    changed = write(tmp_path, scores="{rpe_delta: 5.0}")
+    code, _, err = call("run", changed, "--out", tmp_path, "--jobs", 1, "--only", "dead-reckoning")
+    assert code == 0
+    assert pd.read_csv(tmp_path / "short" / "table.csv")["label"].tolist() == ["dead-reckoning"]
+    assert "1 rows of another spec or version are left out" in err
+
+
 def test_only_leaves_the_others_in_the_csv(tmp_path: Path) -> None:
     file = write(tmp_path)
     assert call("run", file, "--out", tmp_path, "--jobs", 2)[0] == 0
