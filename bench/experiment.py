@@ -95,7 +95,7 @@ class LogSpec:
 
     def _default_name(self) -> str:
         if self.log is not None:
-            return Path(self.log).name
+            return Path(self.log).name or Path(self.log).resolve().name
         scenario = Scenario.from_dict(self.scenario or {})
         return f"{scenario.mission}-{scenario.imu}" if isinstance(scenario.imu, str) else scenario.mission
 

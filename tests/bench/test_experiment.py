@@ -321,3 +321,9 @@ def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.Monke
     monkeypatch.setattr("fathom.bench.runner.Bench.execute", lambda bench, task: [])
     work(Gone())
     signal.signal(signal.SIGINT, before)
+
+
+def test_the_log_of_the_current_folder_is_called_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    content = {"name": "e", "logs": [{"log": "."}], "estimators": [{"name": "eskf"}]}
+    assert Experiment.from_dict(content).logs[0].name == tmp_path.name
