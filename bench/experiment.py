@@ -120,6 +120,15 @@ class LogSpec:
         found = next((place for place in places if place.suffix == ".yaml" and place.is_file()), None)
         return sha256(found.read_bytes()).hexdigest() if found else None
 
+    @property
+    def path_sha256(self) -> str | None:
+        """Of the recorded path that a simulated log follows; None where there is none, or it cannot be read."""
+        path = Scenario.from_dict(self.scenario or {}).path if self.scenario is not None else None
+        try:
+            return None if path is None else sha256(Path(path).read_bytes()).hexdigest()
+        except OSError:  # the run will say so
+            return None
+
     def open(self, seed: int | None, data: Path | None = None, repair: bool = False) -> Log:
         """Simulate the log from this seed, or read it.
 

@@ -86,7 +86,8 @@ def identity(spec: Mapping[str, Any], readings_sha256: str | None) -> str:
 
     Args:
         spec: as `Experiment.spec` gives it.
-        readings_sha256: of a recorded log; None for a simulated one, which its spec determines.
+        readings_sha256: of a recorded log, or of the recorded path that a simulated one follows; None for any other,
+            which its spec determines.
     """
     package = package_of(spec["estimator"]["name"])
     decides = {"spec": spec, "readings": readings_sha256, "versions": versions(), "package": package}

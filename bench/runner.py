@@ -58,7 +58,7 @@ class Task:
     data: Path | None = None
     repair: bool = False
     readings_sha256: str | None = None
-    """Of a recorded log; see `ledger.identity`."""
+    """Of a recorded log, or of a simulated one's recorded path; see `ledger.identity`."""
 
     @cached_property
     def spec(self) -> dict[str, Any]:
@@ -208,6 +208,8 @@ def _order(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]]]:
                 duration_s[spec.name], readings[spec.name] = log.duration_s, content_sha256(log)
             else:
                 duration_s[spec.name] = spec.duration_s
+                if (path := spec.path_sha256) is not None:
+                    readings[spec.name] = path
         except RecordingNotFound as error:
             missing[spec.name] = f"not here: {error}"
     here = [
@@ -233,8 +235,6 @@ def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
     return rows.drop(columns="order").reset_index(drop=True)
 
 
-# -- in the parent: workers and what becomes of them ------------------------------------------------------------------
-
 def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
     """Return which of the rows `rows_of` gave were made under another spec or version than a run today would be."""
     runs = {(run.log.name, run.estimator.label, run.seed): run for run in experiment.runs()}
@@ -250,6 +250,8 @@ def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
 
     return pd.Series([is_old(row) for row in rows.itertuples()], index=rows.index, dtype=bool)
 
+
+# -- in the parent: workers and what becomes of them ------------------------------------------------------------------
 
 
 @dataclass

@@ -128,6 +128,21 @@ def test_two_writers_at_once_get_a_plain_error(tmp_path: Path) -> None:
         pass
 
 
+def test_another_recorded_path_under_the_same_name_is_another_log(tmp_path: Path, ran: list[str]) -> None:
+    scenario: dict[str, Any] = {"mission": "recorded", "path": str(tmp_path / "path.tum"), "duration_s": 20}
+    plan = experiment(logs=[{"scenario": scenario | {"path_spacing_s": 1.0, "path_start_s": 30.0}}])
+    truth = simulate(Scenario(mission="lawnmower", duration_s=80), seed=1).truth
+    assert truth is not None
+    truth.to_tum(tmp_path / "path.tum")
+    first = run_experiment(plan, out=tmp_path / "out")
+    assert first["status"].tolist() == ["done"]
+    assert run_experiment(plan, out=tmp_path / "out").attrs["standing"] == 1
+    replace(truth, p_WB_W=1.1 * truth.p_WB_W).to_tum(tmp_path / "path.tum")
+    again = run_experiment(plan, out=tmp_path / "out")
+    assert again.attrs["renewed"] == 1
+    assert again["identity"].tolist() != first["identity"].tolist()
+
+
 def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
     spec = experiment().spec(experiment().runs()[0])
     assert identity(spec, None) == identity(json.loads(json.dumps(spec)), None)
