@@ -123,10 +123,10 @@ class Store:
         self.write([row])
         return True
 
-    def finished(self) -> set[tuple[str, str, int | None, str]]:
-        """Return log, label, seed and identity of every run that came to an end that counts."""
+    def finished(self) -> set[tuple[str, str, int | None, str | None]]:
+        """Return log, label, seed and identity (None: by an older version) of every run that came to a final end."""
         final = ", ".join(f"'{status}'" for status in FINAL)
-        query = f"SELECT DISTINCT log, label, seed, identity FROM runs WHERE status IN ({final}) AND identity NOT NULL"
+        query = f"SELECT DISTINCT log, label, seed, identity FROM runs WHERE status IN ({final})"
         return set(self.connection.execute(query))
 
     def trajectories(self) -> set[str]:

@@ -143,6 +143,15 @@ def test_another_recorded_path_under_the_same_name_is_another_log(tmp_path: Path
     assert again["identity"].tolist() != first["identity"].tolist()
 
 
+def test_rows_of_an_older_version_are_renewed_and_counted(tmp_path: Path, ran: list[str]) -> None:
+    run_experiment(experiment(), out=tmp_path)
+    with closing(sqlite3.connect(tmp_path / "t" / "runs.sqlite")) as store, store:
+        store.execute("ALTER TABLE runs DROP COLUMN identity")
+    rows = run_experiment(experiment(), out=tmp_path)
+    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 1)
+    assert len(load_runs(tmp_path / "t")) == 1
+
+
 def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
     spec = experiment().spec(experiment().runs()[0])
     assert identity(spec, None) == identity(json.loads(json.dumps(spec)), None)
