@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
 from hashlib import sha256
@@ -105,7 +105,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
 
     path = folder / "lock"
     try:
-        handle = path.open("a+", encoding="ascii")
+        handle = path.open("a+b", buffering=0)
     except OSError as error:
         raise ExperimentError(f"{path}: cannot be written ({error.strerror}); give another --out") from None
     with handle:
@@ -113,11 +113,13 @@ def sole_writer(folder: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             handle.seek(0)
-            holder = handle.read(20).strip() or "unknown"
+            holder = handle.read(20).decode("ascii", "replace").strip() or "unknown"
             raise ExperimentError(
                 f"{folder}: another `fathom run` (process {holder}) is writing here; wait for it, or give another --out"
             ) from None
-        handle.truncate(0)
-        handle.write(f"{os.getpid()}\n")
-        handle.flush()
+        except OSError as error:
+            raise ExperimentError(f"{path}: cannot be locked ({error.strerror}); give another --out") from None
+        with suppress(OSError):  # no room for our number, say: the lock holds without
+            handle.truncate(0)
+            handle.write(f"{os.getpid()}\n".encode("ascii"))
         yield

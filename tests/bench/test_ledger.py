@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import signal
@@ -150,6 +152,21 @@ def test_rows_of_an_older_version_are_renewed_and_counted(tmp_path: Path, ran: l
     rows = run_experiment(experiment(), out=tmp_path)
     assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 1)
     assert len(load_runs(tmp_path / "t")) == 1
+
+
+def test_a_full_disk_does_not_keep_the_lock_from_holding(tmp_path: Path) -> None:
+    (tmp_path / "lock").symlink_to("/dev/full")
+    with sole_writer(tmp_path):
+        pass
+
+
+def test_a_folder_that_cannot_be_locked_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.raises(ExperimentError, match="cannot be locked"), sole_writer(tmp_path):
+        pass
 
 
 def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
