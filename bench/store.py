@@ -174,8 +174,10 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
     path = Path(folder) / "runs.sqlite"
     if not path.is_file():
         raise ExperimentError(f"{path}: no such file; `fathom run` makes it")
-    try:
-        with closing(sqlite3.connect(path)) as connection:
+    alone = not os.access(path.parent, os.W_OK) and not path.with_name(f"{path.name}-wal").exists()
+    try:  # SQLite reads a store with a write-ahead log by writing beside it, unless told that nobody changes it
+        uri = f"{path.resolve().as_uri()}{'?immutable=1' if alone else ''}"
+        with closing(sqlite3.connect(uri, uri=True)) as connection:
             return read_rows(connection)
     except sqlite3.Error as error:
         raise ExperimentError(f"{path}: cannot be read as a store of runs ({error})") from None

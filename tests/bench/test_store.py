@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -129,3 +130,17 @@ def test_what_is_no_store_is_said_plainly(tmp_path: Path) -> None:
         file.write_bytes(content)
         with pytest.raises(ExperimentError, match="cannot be read as a store"):
             load_runs(tmp_path)
+
+
+def test_a_store_in_a_read_only_folder_can_be_read(tmp_path: Path) -> None:
+    with Store(tmp_path / "50 % of? #1" / "runs.sqlite") as store:
+        store.write([row()])
+    tmp_path = tmp_path / "50 % of? #1"
+    assert len(load_runs(tmp_path)) == 1
+    tmp_path.chmod(0o555)
+    try:
+        if os.access(tmp_path, os.W_OK):
+            pytest.skip("to this user no folder is read-only")
+        assert len(load_runs(tmp_path)) == 1
+    finally:
+        tmp_path.chmod(0o755)
