@@ -54,7 +54,7 @@ def test_every_example_is_valid(where: str, text: str) -> None:
 
 def test_the_examples_are_found_and_a_wrong_one_is_refused() -> None:
     texts = dict(examples())
-    assert {where.split(":")[0] for where in texts} >= {"your-own-log.md", "formats.md", "formats-ardupilot.md"}
+    assert {where.split(":")[0] for where in texts} >= {"your-own-log.md", "formats.md", "ablation.md"}
     whole = next(text for where, text in texts.items() if where.startswith("your-own-log.md"))
     with pytest.raises(DatasetError, match="did you mean 'table'"):
         check(whole.replace("table: {file: ins.txt", "tabel: {file: ins.txt"), "here")
