@@ -113,8 +113,9 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
     from .table import print_table, write_consistency, write_paired, write_table
 
     every = rows_of(load_runs(folder), plan.runs())
-    old = outdated(every, plan) & ~every["identity"].isin(rows["identity"])
-    every = every.loc[~old]
+    others = every.loc[~every["identity"].isin(rows["identity"])]
+    old = others.index[outdated(others, plan)]
+    every = every.drop(old)
     differences = paired(every, plan.comparisons(), plan.compare)
     try:
         write_table(every, folder / "table.csv")
@@ -131,8 +132,8 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
         _say(f"{standing} runs were done already; --force does them again")
     if renewed:
         _say(f"{renewed} runs were done under another spec, log or version, and made anew")
-    if old.any():
-        _say(f"{old.sum()} rows of another spec or version are left out of the files; without --only they are renewed")
+    if len(old):
+        _say(f"{len(old)} rows of another spec or version are left out of the files; without --only they are renewed")
     for log, cause in rows.attrs["kept"].items():
         _say(f"{log}: {cause}; its rows are from an earlier run")
 

@@ -44,11 +44,9 @@ def versions() -> dict[str, str]:
 @cache
 def code_sha256() -> str:
     """Return the hash of the source files of our three packages, by name and content."""
-    here = Path(__file__).parent
     digest = sha256()
     for package in ("bench", "datasets", "estimators"):
-        folder = here.parent / package
-        for path in sorted((folder if folder.is_dir() else here).rglob("*.py")):
+        for path in sorted((Path(__file__).parents[1] / package).rglob("*.py")):
             digest.update(f"{package}/{path.name}".encode() + sha256(path.read_bytes()).digest())
     return digest.hexdigest()
 
