@@ -24,7 +24,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from .log import AttitudeStream, Log
+from .log import Log
 from .rest import EARTH_RATE_RADPS, REST_M_S, mean_velocity
 from .state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, NavState, TimeArray
 from .window import Window, skew
@@ -250,11 +250,7 @@ class InitialState:
             return
         heading, w = self._log.heading, self._whole
         assert heading is not None
-        z = heading.z[self._headings]
-        if isinstance(heading, AttitudeStream):
-            psi, sigma = np.arctan2(z[:, 3], z[:, 0]), np.nanmin(heading.sigma[self._headings], axis=1)
-        else:
-            psi, sigma = z[:, 0], heading.sigma[self._headings, 0]
+        psi, sigma = heading.psi[self._headings], np.nanmin(heading.sigma[self._headings], axis=1)
         k = w.moments(heading.t_ns[self._headings])
         R_level = level(x[GRAVITY])
         a_E = w.R_EB[k] @ self._rig.heading.R_BS[:, 0]

@@ -133,11 +133,21 @@ class HeadingStream(ReadingStream):
 
     name, width, residual_width = "heading", 1, 1
 
+    @property
+    def psi(self) -> Array:
+        """(n,) rad, counter-clockwise from east."""
+        return self.z[:, 0]
+
 
 class AttitudeStream(ReadingStream):
     """Full attitude R_WH of the heading sensor (equation 3); counts as the sensor "heading"."""
 
     name, width, residual_width = "attitude", 9, 3
+
+    @property
+    def psi(self) -> Array:
+        """(n,) rad: azimuth of the sensor's x axis, counter-clockwise from east."""
+        return np.arctan2(self.z[:, 3], self.z[:, 0])
 
     def __post_init__(self) -> None:
         super().__post_init__()

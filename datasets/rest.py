@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .log import AttitudeStream, Log
+from .log import Log
 from .state import Array, TimeArray
 from .window import heard
 
@@ -95,8 +95,7 @@ def heading_rate(log: Log, start_ns: int, end_ns: int) -> tuple[float, float] | 
     rows = heard(log.heading, start_ns, end_ns)
     if log.heading is None or len(rows) < 4:
         return None
-    z = log.heading.z[rows]
-    psi = np.unwrap(np.arctan2(z[:, 3], z[:, 0]) if isinstance(log.heading, AttitudeStream) else z[:, 0])
+    psi = np.unwrap(log.heading.psi[rows])
     rate, spread_s = _slope(log.heading.t_ns[rows], psi[:, None])
     t_s = (log.heading.t_ns[rows] - log.heading.t_ns[rows].mean()) * 1e-9
     left = psi - psi.mean() - rate[0] * (t_s - t_s.mean())

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from ...datasets.log import AttitudeStream, Log
+from ...datasets.log import Log
 from ...datasets.state import Array, TimeArray
 
 LEVEL_S = 2.0
@@ -102,9 +102,7 @@ def cross(a: Array, b: Array) -> Array:
 def headings(log: Log) -> tuple[Array, Array]:
     """Return when (n,) s, and the azimuth (n,) rad of the heading sensor's x axis, unwrapped."""
     assert log.heading is not None
-    z = log.heading.z
-    psi = np.arctan2(z[:, 3], z[:, 0]) if isinstance(log.heading, AttitudeStream) else z[:, 0]
-    return seconds(log, log.heading.t_ns), np.unwrap(psi)
+    return seconds(log, log.heading.t_ns), np.unwrap(log.heading.psi)
 
 
 def yaw_by_heading(log: Log, imu: Inertial) -> tuple[Array, Array]:
