@@ -14,7 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from .description import Column, Table
-from .errors import DatasetError, nearest
+from .errors import DatasetError, nearest, nearest_file
 from .state import LIMIT_NS, TimeArray
 
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -47,8 +47,7 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
         return _read_arrays(folder, table.arrays, [*columns, *times])
     path = folder / table.file
     if not path.is_file():
-        names = [p.name for p in path.parent.iterdir() if p.is_file()] if path.parent.is_dir() else []
-        raise DatasetError(f"{path}: no such file{nearest(path.name, names)}")
+        raise DatasetError(f"{path}: no such file{nearest_file(path)}")
     wanted = dict.fromkeys([*columns, *times])
     try:
         pieces = (
@@ -92,8 +91,7 @@ def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Col
     for name, file in arrays.items():
         path = folder / file
         if not path.is_file():
-            names = [p.name for p in path.parent.iterdir() if p.is_file()] if path.parent.is_dir() else []
-            raise DatasetError(f"{path}: no such file{nearest(path.name, names)}")
+            raise DatasetError(f"{path}: no such file{nearest_file(path)}")
         try:
             values = np.load(path, mmap_mode="r", allow_pickle=False)
         except Exception as error:  # numpy raises many kinds for a file that is not what it seems
@@ -104,9 +102,7 @@ def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Col
     lengths = {name: len(values) for name, values in found.items()}
     if len(set(lengths.values())) > 1:
         raise DatasetError(f"{folder}: arrays that stand side by side must be of one length, found {lengths}")
-    for column in wanted:
-        if str(column) not in found:
-            raise DatasetError(f"{folder}: no column {column!r}{nearest(str(column), found)}; found {', '.join(found)}")
+    _check_held(map(str, wanted), list(found), folder)
     return {column: np.array(found[str(column)]) for column in dict.fromkeys(wanted)}
 
 

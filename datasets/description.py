@@ -7,7 +7,7 @@ Lengths of lists are checked here, so nothing is read before the whole descripti
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 
 import numpy as np
 import yaml
@@ -25,6 +25,7 @@ Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
 """Seconds to add to a time, s: 73 years at most, so that no sum of them overflows."""
 Column = int | str
 Matrix = tuple[Vector, Vector, Vector]
+Checked = TypeVar("Checked", bound=BaseModel)
 
 
 class Part(BaseModel):
@@ -587,15 +588,16 @@ def read_description(path: Path) -> Description:
 def check_description(raw: dict[Any, Any], where: str) -> Description:
     """Check a parsed description; `where` stands at the head of the error."""
     recording = raw.get("recording")
-    model: type[BaseModel] = Description
+    if isinstance(recording, dict):
+        raw = {**raw, "recording": _checked(_loader(recording, where), recording, where, ("recording",))}
+    return _checked(Description, raw, where)
+
+
+def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple[str, ...] = ()) -> Checked:
+    """Return the part that `raw` describes, which stands at `above` in the description."""
     try:
-        if isinstance(recording, dict):
-            model = _loader(recording, where)
-            raw = {**raw, "recording": model.model_validate(recording)}
-            model = Description
-        return Description.model_validate(raw)
+        return model.model_validate(raw)
     except ValidationError as error:
-        above = () if model is Description else ("recording",)
         lines = [_complaint(problem, model, above) for problem in error.errors(include_url=False)]
         raise DatasetError(f"{where}: " + f"\n{where}: ".join(dict.fromkeys(lines))) from None
     except (RecursionError, OverflowError) as error:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from importlib.metadata import EntryPoint
+from pathlib import Path
 
 
 class DatasetError(ValueError):
@@ -15,3 +17,20 @@ def nearest(name: str, known: Iterable[str]) -> str:
     folded = {other.casefold(): other for other in known}
     close = difflib.get_close_matches(name.casefold(), folded, n=1)
     return f"; did you mean {folded[close[0]]!r}?" if close else ""
+
+
+def nearest_file(path: Path, *, folders: bool = False) -> str:
+    """Return what `nearest` says of a file that is not there, of the files (and folders) beside it."""
+    beside = path.parent.iterdir() if path.parent.is_dir() else []
+    return nearest(path.name, [other.name for other in beside if folders or other.is_file()])
+
+
+def one_line(error: Exception) -> str:
+    """Return the kind of an error and what it says, in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def not_loaded(point: EntryPoint, error: Exception) -> str:
+    """Say that what an installed package brings cannot be loaded, and why."""
+    package = point.dist.name if point.dist else point.value
+    return f"cannot be loaded from the package {package!r}: {one_line(error)}"

@@ -20,7 +20,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DatasetError, nearest
+from .errors import DatasetError, nearest, nearest_file
 from .recording import Held, Messages, Recording, Wanted, not_held
 
 HEADER = np.dtype(
@@ -168,8 +168,7 @@ def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
     """Open a file, or a member of an archive, as a stream of bytes; gunzipped where its name ends in .gz."""
     path = folder / file
     if not path.is_file():
-        names = [p.name for p in folder.iterdir() if p.is_file()] if folder.is_dir() else []
-        raise DatasetError(f"{path}: no such file{nearest(path.name, names)}")
+        raise DatasetError(f"{path}: no such file{nearest_file(path)}")
     archive = None
     try:
         if path.suffix == ".zip":

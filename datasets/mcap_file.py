@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DatasetError
+from .errors import DatasetError, one_line
 from .recording import extra, not_held
 from .ros_messages import Definitions, Types, definitions_of, ros_channel, short_name
 from .topics import NS, Channel, Found, Message, Misfit, ShortArray, TopicRecording
@@ -211,7 +211,7 @@ def _protobuf_channel(topic: str, kind: str, schema: Any, where: str) -> Channel
                 raise ValueError(f"its schema is {None if schema is None else schema.encoding!r}")
             decode(b"")
         except Exception as error:  # a damaged schema: protobuf's many ways to fail
-            what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+            what = one_line(error)[:200]
             raise DatasetError(f"{where}: the definition of {kind} cannot be understood: {what}") from None
         return decode
 

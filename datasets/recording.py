@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from .errors import DatasetError, nearest
+from .errors import DatasetError, nearest, nearest_file, not_loaded
 
 LOADERS = {
     "ardupilot": "ardupilot:ArduPilotRecording",
@@ -110,8 +110,7 @@ class Recording(BaseModel):
         """
         path = folder / self.file
         if not path.exists():
-            names = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-            raise DatasetError(f"{path}: no such file{nearest(path.name, names)}")
+            raise DatasetError(f"{path}: no such file{nearest_file(path, folders=True)}")
         return path
 
 
@@ -136,14 +135,13 @@ def loader(name: object) -> type[Recording]:
     try:
         return point.load()
     except Exception as error:  # whatever somebody's module does when it is imported
-        package = point.dist.name if point.dist else point.value
-        what = " ".join(f"{type(error).__name__}: {error}".split())
-        raise DatasetError(f"format {name!r}: cannot be loaded from the package {package!r}: {what}") from error
+        raise DatasetError(f"format {name!r}: {not_loaded(point, error)}") from error
 
 
 def recording_at(path: Path) -> Recording | None:
     """Return the loader of a file that nobody has described, by how its name ends; None where that tells nothing."""
-    for name in known_formats():
+    others = sorted(_plugins().keys() - LOADERS.keys())
+    for name in [*LOADERS, *others]:  # nobody else's package is imported where ours can help
         kind = loader(name)
         if path.name.lower().endswith(kind.suffixes or ("\0",)):
             return kind(format=name, file=path.name)

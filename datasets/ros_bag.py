@@ -19,7 +19,7 @@ from typing import IO, Any
 
 import yaml
 
-from .errors import DatasetError, nearest
+from .errors import DatasetError, nearest, nearest_file
 from .mcap_file import mcap_messages
 from .recording import extra
 from .ros_messages import Definition, Definitions, Types, definitions_of, parse_definitions, ros_channel, short_name
@@ -70,8 +70,7 @@ def own_definitions(folder: Path, files: Sequence[str]) -> dict[str, Definition]
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, ValueError) as error:
-            names = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-            raise DatasetError(f"{path}: cannot be read: {error}{nearest(path.name, names)}") from None
+            raise DatasetError(f"{path}: cannot be read: {error}{nearest_file(path, folders=True)}") from None
         packages = [part for part in path.resolve().parts[:-1] if part != "msg"]
         read = parse_definitions(text, f"{packages[-1]}/{path.stem}", str(path))
         types |= {kind: fields for kind, fields in read.items() if fields or "MSG:" not in text}
@@ -323,8 +322,8 @@ def _files(path: Path, about: Mapping[str, Any]) -> list[Path]:
     files = [path / PurePosixPath(name).name for name in named]
     for file in files:
         if not file.is_file():
-            names = [p.name for p in path.iterdir()]
-            raise DatasetError(f"{file}: no such file, but metadata.yaml names it{nearest(file.name, names)}")
+            hint = nearest_file(file, folders=True)
+            raise DatasetError(f"{file}: no such file, but metadata.yaml names it{hint}")
     return files
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DatasetError
+from .errors import DatasetError, one_line
 from .recording import extra, not_held
 from .topics import NS, Channel, Misfit, ShortArray
 
@@ -125,7 +125,7 @@ def definitions_of(text: str, encoding: str, kind: str, where: str) -> dict[str,
                 store.register(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL:") else part))
         joined, _ = store.generate_msgdef(short_name(kind).replace("/", "/msg/"), ros_version=2)
     except Exception as error:  # a parser's many ways to fail
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        what = one_line(error)[:200]
         raise DatasetError(f"{where}: the definition of {kind} cannot be understood: {what}") from None
     return parse_definitions(joined, kind, where)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from ..datasets.errors import nearest
+from ..datasets.errors import nearest, not_loaded
 from .dead_reckoning import DeadReckoning
 from .eskf import ErrorStateKalmanFilter
 from .eskf_filterpy import FilterpyKalmanFilter
@@ -56,9 +56,7 @@ def load_estimator(name: str) -> Any:
     try:
         return point.load()
     except Exception as error:  # whatever somebody's module does when it is imported
-        package = point.dist.name if point.dist else point.value
-        what = " ".join(f"{type(error).__name__}: {error}".split())
-        raise EstimatorError(f"{name}: cannot be loaded from the package {package!r}: {what}") from error
+        raise EstimatorError(f"{name}: {not_loaded(point, error)}") from error
 
 
 def _plugins() -> dict[str, EntryPoint]:
