@@ -241,11 +241,12 @@ def inspect(
         from .inspection.contents import print_contents
         from .inspection.inspecting import inspect_log, open_to_inspect
         from .inspection.page import page_file, print_inspection, save_page
+        from .terminal import console
 
         undescribed = _undescribed(Path(log))
         if undescribed is not None:
             held = undescribed.contents(Path(log).parent)
-            print_contents(held, Console() if sys.stdout.isatty() else Console(width=120))
+            print_contents(held, console())
             return
         page_file(out, "")  # refuses before anything is read
         with Console(stderr=True).status(f"inspecting {log}") as status:
@@ -254,8 +255,7 @@ def inspect(
             file = page_file(out, opened.name)
             status.update(f"drawing {file}")
             save_page(inspection, file)
-        console = Console()
-        print_inspection(inspection, console if console.is_terminal else Console(width=120))
+        print_inspection(inspection, console())
         typer.echo(f"figure: {file}")
 
 
@@ -325,14 +325,14 @@ def _score_rows(title: str, numbers: object, over: str) -> list[list[str]]:
 
 def _print_scores(rows: list[list[str]]) -> None:
     from rich import box
-    from rich.console import Console
     from rich.table import Table
+
+    from .terminal import console
 
     table = Table("", *STATISTICS, "over", box=box.SIMPLE_HEAD)
     for row in rows:
         table.add_row(*row)
-    console = Console()
-    (console if console.is_terminal else Console(width=120)).print(table)
+    console().print(table)
 
 
 @contextmanager
