@@ -12,8 +12,15 @@ from .findings import Check
 from .headings import gyro_against_heading, heading_against_truth
 from .inertial import inertial_of
 from .lever_arm import imu_against_dvl, mirrored_dvl, up_check
-from .references import depth_against_truth, dvl_against_truth, gps_against_truth, truth_against_itself
-from .velocity import dvl_against_positions, positions
+from .path_fit import positions
+from .references import (
+    depth_against_truth,
+    dvl_against_truth,
+    gps_against_truth,
+    reference_of,
+    truth_against_itself,
+)
+from .velocity import dvl_against_positions
 
 
 def cross_checks(log: Log) -> list[Check]:
@@ -25,7 +32,7 @@ def cross_checks(log: Log) -> list[Check]:
     """
     silent: dict[str, Any] = {name: None for name, stream in log.streams.items() if not len(stream)}
     log = replace(log, **silent)  # a sensor that never spoke is none
-    imu = inertial_of(log)
+    imu, reference = inertial_of(log), reference_of(log)
     answers: list[Answer | None] = []
     if log.dvl is None:
         answers.append(Answer(up_check(log, imu)))
@@ -36,8 +43,11 @@ def cross_checks(log: Log) -> list[Check]:
             answer, log = mirrored  # the other checks go on with what it means
             answers.append(answer)
         answers += [dvl_against_positions(log, imu, where) for where in positions(log, imu)]
-        answers += [dvl_against_truth(log, imu), imu_against_dvl(log, imu)]
-    answers += [gps_against_truth(log), depth_against_truth(log), truth_against_itself(log)]
+        if reference is not None:
+            answers.append(dvl_against_truth(log, imu, reference))
+        answers.append(imu_against_dvl(log, imu))
+    if reference is not None:
+        answers += [gps_against_truth(log, reference), depth_against_truth(log, reference), truth_against_itself(log)]
     met = [answer for answer in answers if answer is not None]
     delays = [delay for answer in met for delay in answer.delays]
     return [*(answer.check for answer in met), clock_check(log, delays)]

@@ -26,7 +26,7 @@ from .fitting import (
     without_trend,
 )
 from .inertial import LEVEL_S, Inertial, headings, seconds
-from .velocity import fit_path, positions
+from .path_fit import fit_path, positions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

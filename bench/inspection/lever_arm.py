@@ -30,7 +30,7 @@ from .fitting import (
 )
 from .headings import mounting_text
 from .inertial import Inertial, cross
-from .velocity import velocities
+from .path_fit import velocities
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

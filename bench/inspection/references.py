@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,12 +10,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...datasets.log import Log
-from ...datasets.state import Array
+from ...datasets.state import Array, TimeArray
 from .answers import Answer, Delay
 from .findings import Check, Finding
 from .fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
 from .inertial import Inertial, cross, seconds
-from .velocity import SCALE_MATTERS, velocities
+from .path_fit import velocities
+from .velocity import SCALE_MATTERS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,6 +75,15 @@ def reference_of(log: Log) -> Reference | None:
     return Reference(t_s, truth.p_WB_W, v_W, truth.R_WB)
 
 
+def _at_sensor(log: Log, reference: Reference, t_ns: TimeArray, p_BS_B: Sequence[float]) -> tuple[Array, Mask, Array]:
+    """Return of a sensor's times those that the reference covers, which they are, and where it was then (n, 3) m."""
+    t_s = seconds(log, t_ns)
+    inside = reference.covers(t_s)
+    t_s = t_s[inside]
+    R_WB = np.nan_to_num(reference.at(t_s, reference.R_WB))
+    return t_s, inside, reference.at(t_s, reference.p_W) + R_WB @ np.asarray(p_BS_B)
+
+
 def truth_against_itself(log: Log) -> Answer | None:
     """Whether the truth's positions move as its velocities say; None where it states none."""
     truth = log.truth
@@ -112,18 +122,14 @@ def truth_against_itself(log: Log) -> Answer | None:
     return Answer(Check(f"{whose} against itself", facts, tuple(findings), draw), delays)
 
 
-def gps_against_truth(log: Log) -> Answer | None:
+def gps_against_truth(log: Log, reference: Reference) -> Answer | None:
     """Whether GPS and truth agree in place, height and time."""
-    reference = reference_of(log)
-    if reference is None or log.gps is None:
+    if log.gps is None:
         return None
-    t_s = seconds(log, log.gps.t_ns)
-    inside = reference.covers(t_s)
-    if np.count_nonzero(inside) < 30:
+    t_s, inside, place = _at_sensor(log, reference, log.gps.t_ns, log.rig.gps.p_BS_B)
+    if len(t_s) < 30:
         return None
-    t_s, z, sigma = t_s[inside], log.gps.z[inside], log.gps.sigma[inside]
-    R = np.nan_to_num(reference.at(t_s, reference.R_WB))
-    place = reference.at(t_s, reference.p_W) + R @ np.asarray(log.rig.gps.p_BS_B)
+    z, sigma = log.gps.z[inside], log.gps.sigma[inside]
     error = z - place
     swapped = z[:, [1, 0]] - place[:, :2]
     if np.median(np.abs(swapped)) < 0.2 * np.median(np.abs(error[:, :2])):
@@ -168,18 +174,14 @@ def gps_against_truth(log: Log) -> Answer | None:
     return Answer(Check(f"GPS against {whose}", facts, tuple(findings), draw), delays)
 
 
-def depth_against_truth(log: Log) -> Answer | None:
+def depth_against_truth(log: Log, reference: Reference) -> Answer | None:
     """Whether depth sensor and truth agree on the height."""
-    reference = reference_of(log)
-    if reference is None or log.depth is None:
+    if log.depth is None:
         return None
-    t_s = seconds(log, log.depth.t_ns)
-    inside = reference.covers(t_s)
-    if np.count_nonzero(inside) < 30:
+    t_s, inside, place = _at_sensor(log, reference, log.depth.t_ns, log.rig.depth.p_BS_B)
+    if len(t_s) < 30:
         return None
-    t_s, z = t_s[inside], log.depth.z[inside, 0]
-    R = np.nan_to_num(reference.at(t_s, reference.R_WB))
-    height = reference.at(t_s, reference.p_W)[:, 2] + (R @ np.asarray(log.rig.depth.p_BS_B))[:, 2]
+    z, height = log.depth.z[inside, 0], place[:, 2]
     middle = float(height.mean())
     whose, block = log.truth_kind, blocks_of(len(t_s))
     columns = {"offset": np.ones(len(t_s))}
@@ -222,10 +224,9 @@ def depth_against_truth(log: Log) -> Answer | None:
     return Answer(Check(f"depth against {whose}", facts, tuple(findings), draw), delays)
 
 
-def dvl_against_truth(log: Log, imu: Inertial) -> Answer | None:
+def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> Answer | None:
     """Whether the DVL reads the truth's velocity, axis by axis; None where the truth has no attitude."""
-    reference = reference_of(log)
-    if reference is None or log.dvl is None or not np.isfinite(reference.R_WB).any():
+    if log.dvl is None or not np.isfinite(reference.R_WB).any():
         return None
     t_s, z, _ = velocities(log)
     inside = reference.covers(t_s)
