@@ -25,7 +25,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from .log import Log
-from .rest import EARTH_RATE_RADPS, REST_M_S, mean_velocity
+from .rest import REST_M_S, mean_velocity
+from .rig import EARTH_RATE_RADPS
 from .state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, NavState, TimeArray
 from .window import Window, skew
 

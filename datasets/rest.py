@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from .log import Log
+from .rig import EARTH_RATE_RADPS
 from .state import Array, TimeArray
 from .window import heard
 
@@ -17,7 +18,6 @@ SCATTER = 1.7
 """Samples may scatter by this much more than the rig's noise; their means over BLOCK_S by SCATTER_OF_MEANS more."""
 SCATTER_OF_MEANS = 3.0
 BLOCK_S = 0.5
-EARTH_RATE_RADPS = 7.3e-5
 REST_M_S = 0.01
 """At rest a vehicle sways by this much, and a sensor's mean is off by this much more than its noise explains."""
 REST_RAD_S = 1e-3
