@@ -13,24 +13,12 @@ from fathom.bench.cli import app
 from fathom.bench.store import load_runs
 from fathom.datasets import Log, Scenario, Trajectory, catalog_names, open_log, simulate
 from fathom.datasets.folder import write_folder
-from fathom.datasets.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from typer.testing import CliRunner
-from written import WRITERS
+from written import WRITERS, geodetic_places, write_arrays
 from written_ardupilot import write_ardupilot
-from written_imc import write_arrays, write_imc
+from written_imc import write_imc
 
 ORIGIN_DEG = (41.18, -8.7)
-
-
-def places(p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return latitude and longitude (rad) of the points of the ellipsoid above or below p_W, found by iteration."""
-    latitude, longitude = (np.array(np.radians(x)) for x in ORIGIN_DEG)
-    start, axes = ecef_from_geodetic(latitude, longitude, np.array(0.0)), enu_axes(latitude, longitude)
-    local = p_W * [1.0, 1.0, 0.0]
-    for _ in range(5):
-        lat, lon, height = geodetic_from_ecef(start + local @ axes)
-        local[:, 2] -= height
-    return lat, lon
 
 
 def write_tum(log: Log, folder: Path) -> Path:
@@ -54,7 +42,7 @@ EXACT: dict[str, Any] = {
 """Formats that hold a log bit for bit."""
 NEARLY: dict[str, Any] = {
     "tum": write_tum,
-    "imc": lambda log, folder: write_imc(log, folder, places),
+    "imc": lambda log, folder: write_imc(log, folder, lambda p_W: geodetic_places(p_W, *np.radians(ORIGIN_DEG))),
     "ardupilot": write_ardupilot,
 }
 """Formats of geodetic places, float32 samples or a device's clock: scores agree to millimetres."""

@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 from fathom.bench import ate, run_log
 from fathom.datasets import DatasetError, Log, Scenario, open_log, simulate
-from fathom.datasets.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from fathom.estimators import create
 from scipy.spatial.transform import Rotation
+from written import geodetic_places
 
 TUTORIAL = Path(__file__).resolve().parents[2] / "docs" / "your-own-log.md"
 ORIGIN = np.radians([41.185, -8.706])
@@ -26,17 +26,6 @@ NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 def microseconds(t_ns: np.ndarray) -> np.ndarray:
     assert not (t_ns % 1000).any()
     return EPOCH_US + t_ns // 1000
-
-
-def latitude_longitude(p_W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the places on the ellipsoid whose horizontal offset from the origin is that of p_W."""
-    axes = enu_axes(*(np.array(x) for x in ORIGIN))
-    start = ecef_from_geodetic(*(np.array(x) for x in (*ORIGIN, 0.0)))
-    local = p_W * [1.0, 1.0, 0.0]
-    for _ in range(5):
-        latitude, longitude, height = geodetic_from_ecef(start + local @ axes)
-        local[:, 2] -= height
-    return latitude, longitude
 
 
 def ddmm(radians: np.ndarray) -> list[str]:
@@ -72,7 +61,7 @@ def write_strangers_files(log: Log, folder: Path) -> None:
     blind = velocity.iloc[::50].assign(VX=-32768, VY=-32768, VZ=-32768, BT=0)
     blind["usec"] += 50_000
     velocity = pd.concat([velocity, blind]).sort_values("usec")
-    latitude, longitude = latitude_longitude(gps.z)
+    latitude, longitude = geodetic_places(gps.z, *ORIGIN)
     roll_pitch_yaw = Rotation.from_matrix(NED_FROM_ENU @ truth.R_WB * FRD).as_euler("ZYX", degrees=True)[:, ::-1]
     tables = {
         "dvl.csv": velocity,

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 import yaml
 from fathom.datasets import Log
 from fathom.datasets.folder import write_folder
+from fathom.datasets.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from fathom.datasets.log import ImuStream
 
 READING = "std_msgs/Header header\nfloat64[] z\nfloat64[] sigma\n"
@@ -33,6 +35,32 @@ def first_seconds(log: Log, seconds: float) -> Log:
         if early.any():
             streams[name] = replace(s, **{k: getattr(s, k)[early] for k in ("t_ns", "received_ns", "z", "sigma")})
     return replace(log, imu=imu, truth=None, **{name: streams.get(name) for name in log.streams})
+
+
+def geodetic_places(p_W: np.ndarray, latitude: float, longitude: float) -> tuple[np.ndarray, np.ndarray]:
+    """Latitude and longitude (rad) of the ellipsoid's points above or below p_W (n, 3), of W's origin given."""
+    at = np.array(latitude), np.array(longitude)
+    start, axes = ecef_from_geodetic(*at, np.array(0.0)), enu_axes(*at)
+    local = p_W * [1.0, 1.0, 0.0]
+    for _ in range(5):
+        lat, lon, height = geodetic_from_ecef(start + local @ axes)
+        local[:, 2] -= height
+    return lat, lon
+
+
+def write_arrays(log: Log, folder: Path) -> Path:
+    """Write every stream as one array of its times and one of each other column."""
+    write_folder(log, folder)
+    described = yaml.safe_load((folder / "log.yaml").read_text())
+    for name, part in described["streams"].items():
+        table = pd.read_parquet(folder / part["table"]["file"])
+        (folder / part["table"]["file"]).unlink()
+        (folder / name).mkdir()
+        for column in table:
+            np.save(folder / name / f"{column}.npy", table[column].to_numpy())
+        part["table"] = {"arrays": {str(column): f"{name}/{column}.npy" for column in table}}
+    (folder / "log.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
+    return folder
 
 
 def rows(log: Log) -> dict[str, list[Row]]:

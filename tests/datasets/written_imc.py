@@ -1,4 +1,4 @@
-"""A simulated log as an LSF of IMC messages, and as NumPy arrays beside their log.yaml; for tests."""
+"""A simulated log as an LSF of IMC messages, beside its log.yaml; for tests."""
 
 from __future__ import annotations
 
@@ -122,22 +122,5 @@ def write_imc(log: Log, folder: Path, places: Any) -> Path:
             said[name]["mounting"] = part["mounting"]
     described |= {"streams": said}
     described["recording"] = {"format": "imc", "file": "Data.lsf", "definitions": "IMC.xml", "source": 27}
-    (folder / "log.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
-    return folder
-
-
-def write_arrays(log: Log, folder: Path) -> Path:
-    """Write every stream as one array of its times and one of each other column."""
-    write_folder(log, folder)
-    described = yaml.safe_load((folder / "log.yaml").read_text())
-    import pandas as pd
-
-    for name, part in described["streams"].items():
-        table = pd.read_parquet(folder / part["table"]["file"])
-        (folder / part["table"]["file"]).unlink()
-        (folder / name).mkdir()
-        for column in table:
-            np.save(folder / name / f"{column}.npy", table[column].to_numpy())
-        part["table"] = {"arrays": {str(column): f"{name}/{column}.npy" for column in table}}
     (folder / "log.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
     return folder
