@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 from fathom.bench.experiment import Experiment, ExperimentError, shipped_experiments
 from fathom.bench.run import warm_up
-from fathom.bench.runner import Worker, run_experiment, work
+from fathom.bench.runner import run_experiment
 from fathom.bench.store import load_runs
 from fathom.bench.summary import summarise
 from fathom.bench.table import failures
+from fathom.bench.workers import Worker
+from fathom.bench.working import work
 from fathom.estimators import create
 
 SHORT = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
@@ -234,7 +236,7 @@ def test_mishaps_are_rows_and_the_others_go_on(tmp_path: Path, mishap: None) -> 
 
 
 def test_a_worker_hung_in_one_call_is_killed(tmp_path: Path, mishap: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fathom.bench.runner.GRACE_S", 15.0)
+    monkeypatch.setattr("fathom.bench.workers.GRACE_S", 15.0)
     warm_up(create("dead-reckoning"))  # or its worker compiles for longer than that
     plan = experiment(
         estimators=[{"name": "mishap", "with": {"kind": "hangs"}}, {"name": "dead-reckoning"}], timeout_s=1.0
@@ -318,7 +320,7 @@ def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.Monke
             raise BrokenPipeError
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr("fathom.bench.runner.Bench.execute", lambda bench, task: [])
+    monkeypatch.setattr("fathom.bench.working.Bench.execute", lambda bench, task: [])
     work(Gone())
     signal.signal(signal.SIGINT, before)
 

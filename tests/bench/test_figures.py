@@ -19,10 +19,10 @@ from fathom.bench.figures import (
     load_trajectory,
     tracks_of,
 )
-from fathom.bench.runner import Bench, Task
 from fathom.bench.store import COLUMNS
 from fathom.bench.summary import records, summarise
 from fathom.bench.table import print_table, write_consistency, write_table
+from fathom.bench.working import Bench, Task
 from rich.console import Console
 from scipy.stats import chi2
 

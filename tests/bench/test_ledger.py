@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fathom.bench import ledger, runner
+from fathom.bench import ledger, runner, working
 from fathom.bench.experiment import Experiment, ExperimentError
 from fathom.bench.ledger import content_sha256, identity, sole_writer
 from fathom.bench.runner import run_experiment
@@ -38,7 +38,7 @@ def experiment(**changes: Any) -> Experiment:
 def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What was run, by name; in this process, since what is tried here is which runs are made."""
     names: list[str] = []
-    bench = runner.Bench()
+    bench = working.Bench()
 
     def here(tasks: Any, jobs: int) -> Any:
         for task in tasks:
@@ -187,13 +187,13 @@ import json, os, random, signal, sqlite3, sys, time
 from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
-from fathom.bench import runner
+from fathom.bench import runner, workers, working
 from fathom.bench.experiment import Experiment
 
 plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
-runner.get_context = lambda kind: get_context("fork")  # children of a warm process start at once
+workers.get_context = lambda kind: get_context("fork")  # children of a warm process start at once
 for run in plan.runs()[:2]:
-    runner.Bench().execute(runner.Task(plan, run, out / "warm"))
+    working.Bench().execute(working.Task(plan, run, out / "warm"))
 
 
 def held():

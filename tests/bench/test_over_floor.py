@@ -14,10 +14,10 @@ from fathom.bench.floor import floors
 from fathom.bench.floor_ratio import OVER
 from fathom.bench.metrics import ScoreError
 from fathom.bench.run import run_log
-from fathom.bench.runner import Bench, Task
 from fathom.bench.store import COLUMNS
 from fathom.bench.summary import summarise
 from fathom.bench.table import print_table
+from fathom.bench.working import Bench, Task
 from fathom.datasets.scenario import Scenario
 from fathom.datasets.simulator import simulate
 from fathom.estimators import create

@@ -13,10 +13,10 @@ import pandas as pd
 import pytest
 from fathom.bench.experiment import Experiment, LogSpec
 from fathom.bench.run import run_log
-from fathom.bench.runner import Bench, Task
 from fathom.bench.store import COLUMNS, Store
 from fathom.bench.summary import summarise
 from fathom.bench.table import write_table
+from fathom.bench.working import Bench, Task
 from fathom.datasets import Log, Scenario, simulate
 from fathom.estimators import create
 
