@@ -312,6 +312,35 @@ def _read_tum(path: Path) -> Trajectory:
         raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
 
 
+@app.command()
+def timing(
+    against: Annotated[
+        str | None, typer.Option(metavar="REV", help="Compare the working tree with this revision instead.")
+    ] = None,
+    only: Annotated[str | None, typer.Option(help="Pattern: a budget's or a benchmark's name.")] = None,
+    short: Annotated[bool, typer.Option("--short", help="With --against: fewer benchmarks, a minute or two.")] = False,
+    limit: Annotated[float, typer.Option(min=1.0, help="With --against: the ratio that is too slow.")] = 1.10,
+    rounds: Annotated[int, typer.Option(min=0, help="With --against: A B B A per pair of processes; 0: default.")] = 0,
+    counters: Annotated[
+        bool, typer.Option("--counters", help="Count work that no machine changes: factors, callbacks, allocations.")
+    ] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where a budget is missed.")] = False,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Also write the figures to this JSON file.")] = None,
+) -> None:
+    """Measure every budget; with --against, tell whether anything has become slower than in another revision."""
+    with refusing_bad_input():
+        from .timing.command import print_budgets, print_comparison, print_counters
+
+        if against is not None:
+            good = print_comparison(against, only, short, limit, rounds, out)
+        elif counters:
+            good = print_counters(out)
+        else:
+            good = print_budgets(only, out) or not strict
+    if not good:
+        raise typer.Exit(SOME_FAILED)
+
+
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 
 

@@ -1,0 +1,1 @@
+"""How fast we are: budgets, benchmarks, comparison with another revision, and counts that no machine changes."""
