@@ -108,7 +108,7 @@ def difference(
     if v.ndim != 1 or len(v) == 0 or v.shape != b.shape or not np.isfinite(np.stack([v, b])).all():
         raise ScoreError("paired difference: expected finite scores in pairs, at least one")
     n_v, n_b = (np.ones(len(v)), np.ones(len(v))) if weights is None else weights
-    take = _TAKE[over]
+    take = TAKE[over]
 
     def less(v: Array, n_v: Array, b: Array, n_b: Array, axis: int = -1) -> Array:
         return take(v, n_v, axis) - take(b, n_b, axis)
@@ -119,8 +119,8 @@ def difference(
     data, method = (v, n_v, b, n_b), "percentile" if over == "median" else "BCa"
     positive, enough = bool((np.minimum(v, b) > 0).all()), len(v) >= FEWEST_SEEDS
     options = {"confidence_level": level, "n_resamples": resamples, "method": method, "seed": seed}
-    low, high = _interval(data, less, **options) if enough else (None, None)
-    ratio_low, ratio_high = _interval(data, through, **options) if enough and positive else (None, None)
+    low, high = bootstrap_interval(data, less, **options) if enough else (None, None)
+    ratio_low, ratio_high = bootstrap_interval(data, through, **options) if enough and positive else (None, None)
     d = v - b
     return Difference(
         pairs=len(v),
@@ -194,21 +194,29 @@ def _rms(x: Array, n: Array, axis: int) -> Array:
     return np.sqrt((n * x * x).sum(axis=axis) / n.sum(axis=axis))
 
 
-_TAKE: dict[Over, Callable[[Array, Array, int], Array]] = {
+TAKE: dict[Over, Callable[[Array, Array, int], Array]] = {
     "rms": _rms,
     "mean": lambda x, n, axis: x.mean(axis=axis),
     "median": lambda x, n, axis: np.median(x, axis=axis),
 }
+"""How scores are taken over seeds, of (scores, weights, axis)."""
 
 
-def _interval(
+def bootstrap_interval(
     data: tuple[Array, ...], statistic: Callable[..., Array], method: str, seed: int, **options: Any
 ) -> tuple[float, float]:
-    """Return the bootstrap interval of a statistic of the seeds."""
+    """Return the bootstrap interval of a statistic of the seeds.
+
+    Args:
+        data: (n,) arrays; a seed's numbers in all of them are drawn together.
+        statistic: of such arrays, along their `axis`.
+        method: "BCa" or "percentile"; the latter also where the former has no answer.
+        seed, options: of `scipy.stats.bootstrap`.
+    """
     each = np.arange(len(data[0]))
     without = np.array([statistic(*(x[each != k] for x in data)) for k in each])
     value = float(statistic(*data))
-    scale = max(float(np.abs(x).max()) for x in (without, data[0], data[2]))
+    scale = max(float(np.abs(x).max()) for x in (without, *data[::2]))
     if method == "BCa" and np.ptp(without) <= 1e-12 * scale:  # every resample says the same
         return value, value
     with warnings.catch_warnings():
