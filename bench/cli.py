@@ -79,6 +79,14 @@ def run(
     ] = None,
     repair: Repair = False,
     force: Annotated[bool, typer.Option("--force", help="Run again what is done already.")] = False,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Run on a Dask cluster: tcp://host:port, its scheduler file (.json), or local: a cluster of --jobs "
+            "processes here.",
+        ),
+    ] = None,
 ) -> None:
     """Run every estimator of EXPERIMENT on every one of its logs, and print the tables.
 
@@ -91,7 +99,7 @@ def run(
         plan = Experiment.load(experiment)
         folder = out / plan.name
         try:
-            rows = run_experiment(plan, data, out, jobs, only, repair, force)
+            rows = run_experiment(plan, data, out, jobs, only, repair, force, dask)
         except KeyboardInterrupt:
             _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}; the same command does the rest")
             raise typer.Exit(INTERRUPTED) from None

@@ -185,6 +185,11 @@ class EstimatorSpec:
         """What a run's spec says of the estimator's options: every one, defaults included."""
         return plain(self.create())
 
+    @cached_property
+    def lag_s(self) -> float:
+        """How far the estimator looks back; 0 where it has no such option."""
+        return float(getattr(self.create(), "lag_s", 0.0))
+
     def variants(self) -> tuple[EstimatorSpec, ...]:
         """Return the estimators that this entry stands for: itself, or its grid; each followed by those with less.
 

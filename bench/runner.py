@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import pandas as pd
 
 from ..datasets.opening import RecordingNotFound
+from .cluster import run_on_cluster
 from .experiment import Experiment, ExperimentError, Run
 from .ledger import content_sha256, sole_writer
 from .store import Row, Store, provenance
@@ -29,6 +30,7 @@ def run_experiment(
     only: str | None = None,
     repair: bool = False,
     force: bool = False,
+    dask: str | None = None,
 ) -> pd.DataFrame:
     """Run every estimator on every log and return the rows of the store, one per run and output.
 
@@ -42,10 +44,11 @@ def run_experiment(
         experiment: an experiment, a shipped one's name, or a YAML file.
         data: where recorded logs are; else FATHOM_DATA.
         out: the rows go to out/<experiment>/runs.sqlite, the trajectories beside it.
-        jobs: worker processes; 0 for one per core.
+        jobs: worker processes; 0 for one per core. The workers of a cluster elsewhere are its own affair.
         only: run only what matches this pattern: an estimator's label, a log's name, or "log/label".
         repair: let loaders drop bad rows, and count them.
         force: run what is in the store already, too.
+        dask: address of a Dask scheduler, its scheduler file, or "local", see `cluster`; else worker processes here.
 
     Raises:
         ExperimentError, EstimatorError, DatasetError: nothing was run.
@@ -56,13 +59,17 @@ def run_experiment(
         raise ExperimentError(f"jobs must be 0 (one per core) or more, found {jobs}")
     folder = Path(out) / experiment.name
     runs = _select(experiment, only)
-    tasks, absent = _order([Task(experiment, run, folder, Path(data) if data else None, repair) for run in runs])
+    tasks, absent = _order([Task.of(experiment, run, Path(data) if data else None, repair) for run in runs])
     _make_room(folder)
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
         missing, renewed = _missing(tasks, store, force)
-        with _progress(len(missing), len(tasks) - len(missing)) as advance:
-            for rows in run_all(missing, jobs):
+        with (
+            _progress(len(missing), len(tasks) - len(missing)) as (advance, say),
+            closing(run_all(missing, jobs) if dask is None else run_on_cluster(missing, dask, jobs, say)) as finished,
+        ):
+            for each in finished:
+                rows = each.keep(folder)
                 store.write(rows)
                 advance(rows)
         _sweep(folder / "trajectories", store.trajectories())
@@ -151,8 +158,7 @@ def _order(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]]]:
     absent = [task.row("absent", missing[task.run.log.name]) for task in tasks if task.run.log.name in missing]
 
     def longest(task: Task) -> tuple[float, str, int, float]:
-        lag_s = float(getattr(task.run.estimator.create(), "lag_s", 0.0))
-        return (-duration_s[task.run.log.name], task.run.log.name, task.run.seed or 0, -lag_s)
+        return (-duration_s[task.run.log.name], task.run.log.name, task.run.seed or 0, -task.run.estimator.lag_s)
 
     return sorted(here, key=longest), absent
 
@@ -183,8 +189,8 @@ def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
 
 
 @contextmanager
-def _progress(missing: int, standing: int) -> Iterator[Any]:
-    """Give a function to call with each finished run's rows; draws a bar on a terminal, nothing elsewhere."""
+def _progress(missing: int, standing: int) -> Iterator[tuple[Callable[[Sequence[Row]], None], Callable[[str], None]]]:
+    """Give functions to call with each finished run's rows, and with a message; the bar is for terminals only."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -201,4 +207,7 @@ def _progress(missing: int, standing: int) -> Iterator[Any]:
         def advance(rows: Sequence[Row]) -> None:
             bar.update(task, advance=1, description=f"{rows[0]['log']} / {rows[0]['label']}: {rows[0]['status']}")
 
-        yield advance
+        def say(message: str) -> None:
+            bar.console.print(message, markup=False, highlight=False, soft_wrap=True)
+
+        yield advance, say

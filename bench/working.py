@@ -1,4 +1,4 @@
-"""In a worker: open a task's log, run its estimator, score what it said, and save its trajectories."""
+"""In a worker: open a task's log, run its estimator, score what it said, and hand back rows and trajectories."""
 
 from __future__ import annotations
 
@@ -6,29 +6,31 @@ import json
 import math
 import os
 import re
-import signal
+import threading
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from hashlib import sha256
 from multiprocessing.connection import Connection
 from pathlib import Path
+from platform import node
 from typing import Any
 
 import numpy as np
 
+from ..datasets.errors import DatasetError
 from ..datasets.log import Log
 from ..datasets.scenario import Scenario
 from ..datasets.trajectory import Trajectory
 from ..estimators.interface import Estimator
 from .consistency import nees_at
-from .experiment import Experiment, Run, plain
+from .experiment import Experiment, ExperimentError, Run, plain
 from .floor import Floor, floors
 from .floor_ratio import FLOORS, floor_scores
 from .ledger import content_sha256, identity
 from .metrics import ScoreError
-from .run import Result, can_judge, costs, innovation_dof, innovation_scores, run_log, scores, warm_up
+from .run import Result, Scoring, can_judge, costs, innovation_dof, innovation_scores, run_log, scores, warm_up
 from .store import Row, provenance
 
 LOGS_KEPT = 2
@@ -37,20 +39,44 @@ LOGS_KEPT = 2
 
 @dataclass(frozen=True)
 class Task:
-    """One run and all a worker needs for it."""
+    """One run and all a worker needs for it, as descriptions: a few kilobytes, however many runs there are.
 
-    experiment: Experiment
+    Attributes:
+        experiment: its name.
+        run: which log, estimator and seed.
+        scoring, max_gap_s, timeout_s: the experiment's, for this log.
+        spec: all that decides the run's numbers but readings and versions, see `Experiment.spec`.
+        lags_s: those of all estimators of the experiment, whose floors are found together.
+        data: where recorded logs are.
+        repair: let loaders drop bad rows.
+        readings_sha256: of a recorded log, or of a simulated one's recorded path; see `ledger.identity`.
+    """
+
+    experiment: str
     run: Run
-    folder: Path
+    scoring: Scoring
+    max_gap_s: float
+    timeout_s: float
+    spec: dict[str, Any]
+    lags_s: tuple[float, ...]
     data: Path | None = None
     repair: bool = False
     readings_sha256: str | None = None
-    """Of a recorded log, or of a simulated one's recorded path; see `ledger.identity`."""
 
-    @cached_property
-    def spec(self) -> dict[str, Any]:
-        """All that decides the run's numbers but readings and versions."""
-        return self.experiment.spec(self.run, self.repair)
+    @staticmethod
+    def of(experiment: Experiment, run: Run, data: Path | None = None, repair: bool = False) -> Task:
+        """Return the task of one of the experiment's runs."""
+        return Task(
+            experiment.name,
+            run,
+            experiment.scoring(run.log),
+            experiment.max_gap_s,
+            experiment.timeout_s,
+            experiment.spec(run, repair),
+            tuple(sorted({estimator.lag_s for estimator in experiment.estimators})),
+            data,
+            repair,
+        )
 
     @cached_property
     def identity(self) -> str:
@@ -59,17 +85,17 @@ class Task:
 
     def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
         """Return what a row says whether the run succeeds or not."""
-        run, scoring = self.run, self.experiment.scoring(self.run.log)
+        run = self.run
         return {
-            "experiment": self.experiment.name,
+            "experiment": self.experiment,
             "log": run.log.name,
             "label": run.estimator.label,
             "seed": run.seed,
             "output": output,
             "status": status,
             "cause": cause,
-            "align": scoring.align,
-            "dims": scoring.dims,
+            "align": self.scoring.align,
+            "dims": self.scoring.dims,
             "estimator": run.estimator.name,
             "identity": self.identity,
             "spec": json.dumps(self.spec),
@@ -77,9 +103,50 @@ class Task:
         } | provenance()
 
 
+@dataclass(frozen=True)
+class Finished:
+    """What a run leaves: its rows, one per output, and its trajectories, by file name, as the bytes of a Parquet file.
+
+    A worker writes no files, so it may be anywhere.
+    """
+
+    rows: list[Row]
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def keep(self, folder: Path) -> list[Row]:
+        """Write the trajectories into trajectories/ of this folder, each whole or not at all, and return the rows.
+
+        A name stands for its content or its run, so a truth that is there already is left alone.
+
+        Raises:
+            ExperimentError: the disk is full, or the folder cannot be written.
+        """
+        folder = folder / "trajectories"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, content in self.files.items():
+                unfinished = folder / f"{name}.{os.getpid()}"
+                unfinished.write_bytes(content)
+                unfinished.replace(folder / name)
+        except OSError as error:
+            raise ExperimentError(f"{folder}: cannot write ({error.strerror}); the runs before are kept") from None
+        return self.rows
+
+
+def main(descriptor: int) -> None:
+    """Be a worker process: do the tasks that come through a connection, as long as there is a parent."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    work(Connection(descriptor))
+
+
+def _end_with_parent() -> None:
+    """Wait until the standard input closes, as it does when the parent is gone, however it went; then end at once."""
+    os.read(0, 1)
+    os._exit(1)
+
+
 def work(connection: Connection) -> None:
-    """Do tasks until there are no more, or no parent; Ctrl-C is the parent's affair."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Do tasks until there are no more, or nobody to tell."""
     bench = Bench()
     while True:
         try:
@@ -89,38 +156,42 @@ def work(connection: Connection) -> None:
 
 
 class Bench:
-    """What a worker keeps from one task to the next: the last logs, and which estimators are compiled."""
+    """What a worker keeps from one task to the next: the last logs with what is made of them, what is compiled."""
 
     def __init__(self) -> None:
         self.logs: OrderedDict[str, Log] = OrderedDict()
         self.floors: dict[str, dict[float, Floor]] = {}
+        self.truth: dict[str, bytes] = {}
         self.warm: set[str] = set()
 
-    def execute(self, task: Task) -> list[Row]:
-        """Do one run and return its rows, whatever happens."""
+    def execute(self, task: Task) -> Finished:
+        """Do one run and return what it leaves, whatever happens."""
         started = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             log = self.open(task)
             estimator = self.estimator(task)
-            experiment, scoring = task.experiment, task.experiment.scoring(task.run.log)
             with _PeakMemory() as memory:
                 result = run_log(
                     log,
                     estimator,
-                    score_period_s=scoring.score_period_s,
-                    max_gap_s=experiment.max_gap_s,
-                    timeout_s=experiment.timeout_s,
-                    nis=scoring.nis,
+                    score_period_s=task.scoring.score_period_s,
+                    max_gap_s=task.max_gap_s,
+                    timeout_s=task.timeout_s,
+                    nis=task.scoring.nis,
                 )
-            return self.rows(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
+            return self.finished(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
         except Exception as error:
-            return [task.row("failed", f"{type(error).__name__}: {error}") | {"started": started}]
+            return Finished([task.row("failed", f"{type(error).__name__}: {error}") | {"started": started}])
 
     def open(self, task: Task) -> Log:
-        """Open or simulate the task's log, unless it is one of the last."""
+        """Open or simulate the task's log, unless it is one of the last.
+
+        Raises:
+            DatasetError: it cannot be read, or its readings are not those that the task is about.
+        """
         key = log_key(task)
         if key not in self.logs:
-            self.logs[key] = task.run.log.open(task.run.seed, task.data, task.repair)
+            self.logs[key] = open_same(task)
         self.logs.move_to_end(key)
         while len(self.logs) > LOGS_KEPT:
             gone, _ = self.logs.popitem(last=False)
@@ -140,24 +211,23 @@ class Bench:
 
         The floors of all the experiment's lags are found together, once for all estimators that use the same sensors.
         """
-        experiment, run = task.experiment, task.run
-        scoring = experiment.scoring(run.log)
+        run, scoring = task.run, task.scoring
         asked = scoring.floor and run.log.scenario is not None and (scoring.align, scoring.dims) == ("none", "3d")
         if not asked or result.status != "done" or result.online is None:
             return dict.fromkeys(FLOORS)
         assert run.seed is not None
         factors = run.estimator.create().factors
-        key = f"{log_key(task)} {sorted(factors)} {scoring.score_period_s} {experiment.max_gap_s}"
+        key = f"{log_key(task)} {sorted(factors)} {scoring.score_period_s} {task.max_gap_s}"
         if lookahead_s not in self.floors.get(key, {}):
-            lags = {getattr(estimator.create(), "lag_s", 0.0) for estimator in experiment.estimators}
             scenario = Scenario.from_dict(run.log.scenario or {})
-            wanted = sorted({0.0, math.inf, lookahead_s, *lags})
-            self.floors[key] = floors(scenario, run.seed, result.online.t_ns, wanted, factors, experiment.max_gap_s)
+            wanted = sorted({0.0, math.inf, lookahead_s, *task.lags_s})
+            self.floors[key] = floors(scenario, run.seed, result.online.t_ns, wanted, factors, task.max_gap_s)
         return floor_scores(self.floors[key][lookahead_s], result.online.t_ns)
 
-    def rows(self, task: Task, log: Log, result: Result, extra: Row) -> list[Row]:
-        """Score a run and save its trajectories: one row per output."""
-        scoring = task.experiment.scoring(task.run.log)
+    def finished(self, task: Task, log: Log, result: Result, extra: Row) -> Finished:
+        """Score a run: one row per output, and its trajectories beside them."""
+        scoring = task.scoring
+        files: dict[str, bytes] = {}
         shared = {
             "failed_at_s": result.failed_at_s,
             "truth_kind": log.truth_kind if log.truth is not None else None,
@@ -170,10 +240,14 @@ class Bench:
         }
         if log.truth is not None and result.online is not None:
             known = log.truth.select(np.flatnonzero(np.isin(log.truth.t_ns, result.online.t_ns)))
-            shared["truth_trajectory"] = save(task, "truth", known)
+            name = shared["truth_trajectory"] = file_name(task, "truth", content_sha256(known))
+            if name not in self.truth:  # the estimators of a log share it
+                self.truth = {name: parquet(known)}
+            files |= self.truth
         rows = []
         for output, trajectory in result.outputs.items():
-            name = save(task, output, trajectory)
+            name = file_name(task, output, task.identity)
+            files[name] = parquet(trajectory)
             row = task.row(result.status, result.cause, output) | shared | scores(log, trajectory, scoring)
             if output == "online":
                 row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
@@ -184,37 +258,54 @@ class Bench:
             if can_judge(log, scoring):
                 row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
             rows.append(row | {"lookahead_s": trajectory.lookahead_s, "trajectory": name})
-        return rows or [task.row(result.status, result.cause) | shared]
+        return Finished(rows or [task.row(result.status, result.cause) | shared], files)
 
 
 def log_key(task: Task) -> str:
     """Return what tells the task's log from any other."""
-    return json.dumps([plain(task.run.log), task.run.seed])
+    return json.dumps([plain(task.run.log), task.run.seed, task.repair, str(task.data), task.readings_sha256])
 
 
-def save(task: Task, output: str, trajectory: Trajectory) -> str:
-    """Write a trajectory beside the store and return its file's name; of the covariance, the 3 × 3 blocks.
+def open_same(task: Task) -> Log:
+    """Open or simulate the task's log.
 
-    The name ends in the identity of the run (of the content, for the truth, which runs share): so a file is never
-    written over with another's content, and a row that stands keeps its own.
+    Raises:
+        DatasetError: it cannot be read; or its readings are not those by which the run is known, as where another
+            machine holds another recording under the same name.
+    """
+    spec, expected = task.run.log, task.readings_sha256
+    log = spec.open(task.run.seed, task.data, task.repair)
+    if expected is not None:
+        found = content_sha256(log) if spec.scenario is None else spec.path_sha256
+        if found != expected:
+            what = "recording" if spec.scenario is None else "recorded path"
+            raise DatasetError(
+                f"{spec.name}: the {what} on {node()} differs from the one where the run was planned "
+                f"(SHA-256 {str(found)[:8]}… here, {expected[:8]}… there); copy it there, or mend --data or FATHOM_DATA"
+            )
+    return log
+
+
+def file_name(task: Task, output: str, content: str) -> str:
+    """Return the name of a trajectory's file.
+
+    It ends in the identity of the run (of the content, for the truth, which runs share): so a file is never written
+    over with another's content, and a row that stands keeps its own.
     """
     label = task.run.estimator.label if output != "truth" else ""
     seed = "" if task.run.seed is None else str(task.run.seed)
-    mark = (content_sha256(trajectory) if output == "truth" else task.identity)[:8]
-    name = "--".join(_file_part(part) for part in (task.run.log.name, label, seed, output, mark) if part) + ".parquet"
-    if output == "truth" and (task.folder / "trajectories" / name).is_file():
-        return name
+    parts = (task.run.log.name, label, seed, output, content[:8])
+    return "--".join(_file_part(part) for part in parts if part) + ".parquet"
+
+
+def parquet(trajectory: Trajectory) -> bytes:
+    """Return a trajectory as the content of a Parquet file; of the covariance, the 3 × 3 blocks."""
     table = trajectory.to_pandas()
     across = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15) if i // 3 != j // 3]
     table = table.drop(columns=across, errors="ignore")
-    folder = task.folder / "trajectories"
-    folder.mkdir(parents=True, exist_ok=True)
-    unfinished = folder / f"{name}.{os.getpid()}"
     with np.errstate(over="ignore"):  # a covariance on its way to infinity may get there
         table = table.astype({column: "float32" for column in table if column.startswith("P_")})
-    table.to_parquet(unfinished, index=False)
-    unfinished.replace(folder / name)
-    return name
+    return table.to_parquet(index=False)
 
 
 def _file_part(text: str) -> str:

@@ -376,6 +376,6 @@ def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.Monk
 
 def test_a_task_knows_its_variant(folder: Path) -> None:
     plan = Experiment.from_dict(PLAN)
-    row = Task(plan, plan.runs()[1], folder).row("done", None)
+    row = Task.of(plan, plan.runs()[1]).row("done", None)
     assert (row["label"], row["estimator"]) == ("eskf no dvl", "eskf")
     assert '"factors": ["depth", "gps", "heading"]' in row["spec"]

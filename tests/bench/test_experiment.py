@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
-import signal
+import os
+import subprocess
 import sys
+import time
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -299,16 +301,39 @@ def test_what_is_in_the_way_of_results_is_named_before_anything_runs(tmp_path: P
     assert not (folder / "runs.sqlite").exists()
 
 
-def test_a_worker_is_deaf_to_ctrl_c_from_its_first_moment_and_the_parent_hears_again() -> None:
-    before = signal.getsignal(signal.SIGINT)
+def test_a_worker_is_out_of_reach_of_ctrl_c_from_its_first_moment() -> None:
     worker = Worker()
     try:
-        status = Path(f"/proc/{worker.process.pid}/status").read_text()
-        ignored = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigIgn")), 16)
-        assert ignored & 1 << (signal.SIGINT - 1)
+        assert os.getpgid(worker.process.pid) == worker.process.pid != os.getpgid(0)
     finally:
         worker.kill()
-    assert signal.getsignal(signal.SIGINT) is before
+
+
+ORPHANED = """
+import sys, time
+from fathom.bench.experiment import Experiment
+from fathom.bench.workers import Worker
+from fathom.bench.working import Task
+
+log = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
+estimator = {"name": "mishap", "with": {"kind": "hangs"}}
+plan = Experiment.from_dict({"name": "t", "logs": [log], "estimators": [estimator]})
+worker = Worker()
+worker.begin(Task.of(plan, plan.runs()[0]))
+print(worker.process.pid, flush=True)
+time.sleep(3600)
+"""
+
+
+def test_a_worker_in_the_midst_of_a_run_ends_with_its_parent(tmp_path: Path, mishap: None) -> None:
+    with subprocess.Popen([sys.executable, "-c", ORPHANED], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    give_up_s = time.monotonic() + 60
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < give_up_s:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
 
 
 def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,10 +344,8 @@ def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.Monke
         def send(self, rows: object) -> None:
             raise BrokenPipeError
 
-    before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr("fathom.bench.working.Bench.execute", lambda bench, task: [])
     work(Gone())
-    signal.signal(signal.SIGINT, before)
 
 
 def test_the_log_of_the_current_folder_is_called_after_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

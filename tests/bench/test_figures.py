@@ -46,7 +46,7 @@ def rows(folder: Path) -> pd.DataFrame:
         }
     )
     bench = Bench()
-    found = [row for run in plan.runs() for row in bench.execute(Task(plan, run, folder))]
+    found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).keep(folder)]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS))
 
 
@@ -191,7 +191,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path
         }
     )
     bench = Bench()
-    found = [row for run in plan.runs() for row in bench.execute(Task(plan, run, folder))]
+    found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).keep(folder)]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
 
 

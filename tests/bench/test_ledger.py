@@ -186,14 +186,28 @@ KILLED = """
 import json, os, random, signal, sqlite3, sys, time
 from contextlib import closing
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from fathom.bench import runner, workers, working
 from fathom.bench.experiment import Experiment
 
 plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
-workers.get_context = lambda kind: get_context("fork")  # children of a warm process start at once
+
+
+class Forked:
+    # a worker's process as the child of a warm one, which starts at once
+    stdin = None
+
+    def __init__(self, descriptor):
+        theirs = Connection(os.dup(descriptor))
+        self.process = get_context("fork").Process(target=working.work, args=(theirs,), daemon=True)
+        self.process.start()
+        self.kill, self.wait = self.process.kill, self.process.join
+
+
+workers.start = Forked
 for run in plan.runs()[:2]:
-    working.Bench().execute(working.Task(plan, run, out / "warm"))
+    working.Bench().execute(working.Task.of(plan, run))
 
 
 def held():

@@ -50,7 +50,7 @@ def test_a_run_is_stored_with_its_start(tmp_path: Path, monkeypatch: pytest.Monk
     plan = Experiment.from_dict(PLAN)
     with Store(tmp_path / "runs.sqlite") as store:
         for run in plan.runs():
-            store.write(Bench().execute(Task(plan, run, tmp_path)))
+            store.write(Bench().execute(Task.of(plan, run)).keep(tmp_path))
         rows = store.read()
     start = "given" if prior == "given" else "moving, heading unknown"
     assert rows["status"].tolist() == ["done"]
