@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from .drawing import WIDTH_IN, Look, empty_figure, logarithmic
+from .drawing import TEXT_PT, TITLE_PT, WIDTH_IN, Look, empty_figure, legend_below, logarithmic, narrow, title_above
 from .summary import Record, groups
 from .table import percent, score_name, who
 
@@ -17,14 +18,17 @@ BAR = 0.72
 """Height of a bar, in lines."""
 WIDE = 4.0
 """Where ratios span more than this factor, their axis is logarithmic."""
-PALE = "#999999"
+UNIT = r" (m|°|%|m/s|µs)$"
+LETTERS = 30
+"""In a line of a variant's name."""
+MINUS = "\N{MINUS SIGN}"
 
 
 def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: str) -> Figure:
     """Draw the ratio of each score to its baseline's as a bar from 1, with its interval: a row of panels per baseline.
 
-    Full for what was said at once, open with hindsight. Beside a bar stands by how much the score changed, pale where
-    the test, corrected for how many tests there are, does not tell the change from chance at 5 %.
+    Full for what was said at once, open with hindsight. Beside a bar stands by how much the score changed, in brackets
+    where the test, corrected for how many tests there are, does not tell the change from chance at 5 %.
 
     Args:
         differences: records of `paired` whose ratio is known, of one baseline's log.
@@ -35,8 +39,9 @@ def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: 
     baselines = groups(differences, "baseline_label")
     lines = {label: _lines(rows) for (label,), rows in baselines.items()}
     heights = [len(of) + 2.5 for of in lines.values()]
+    line_in = 0.25 if any(len(name) > LETTERS for of in lines.values() for name, _ in of) else 0.17
     figure, panels = empty_figure(
-        len(lines), len(scores), WIDTH_IN, 1.1 + 0.17 * sum(heights), share_x=False, heights=heights
+        len(lines), len(scores), WIDTH_IN, 0.5 + line_in * sum(heights), share_x=False, heights=heights
     )
     for k, (label, of_baseline) in enumerate(lines.items()):
         row_of_panels = panels[k * len(scores) : (k + 1) * len(scores)]
@@ -47,21 +52,21 @@ def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: 
             axes.set_yticks([])
             axes.grid(visible=False, axis="y")
             if k == 0:
-                axes.set_title(score_name(score), fontsize=9)
-        row_of_panels[0].set_yticks(range(len(of_baseline)), [name for name, _ in of_baseline])
+                axes.set_title(re.sub(UNIT, "", score_name(score)), fontsize=TITLE_PT)
+        row_of_panels[0].set_yticks(range(len(of_baseline)), [narrow(name, LETTERS, 2) for name, _ in of_baseline])
         row_of_panels[0].tick_params(axis="y", length=0)
-        row_of_panels[0].set_ylabel(f"against\n{label}", fontsize=7)
+        row_of_panels[0].set_ylabel(f"against\n{narrow(label, 18)}", fontsize=TEXT_PT)
     for axes in panels[-len(scores) :]:
         axes.set_xlabel("times the baseline's")
     seeds = [row["pairs"] for row in differences if row["low"] is not None]
     over = f", {max(seeds)} seeds, 95 % intervals" if seeds else ""
-    figure.suptitle(f"{title}: what each variant changes{over}", fontsize=10)
+    title_above(figure, f"{title}: what each variant changes{over}")
     handles = [Patch(facecolor="#555555", edgecolor="#555555", label="at once")]
     if any(row["output"] == "hindsight" for row in differences):
         handles.append(Patch(facecolor="white", edgecolor="#555555", label="with hindsight"))
     if seeds:
-        handles.append(Patch(facecolor="none", label="pale number: p (Holm) of 0.05 or more"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+        handles.append(Patch(facecolor="none", label="in brackets: p (Holm) of 0.05 or more"))
+    legend_below(figure, handles)
     return figure
 
 
@@ -86,18 +91,18 @@ def _draw(axes: Axes, bars: Sequence[tuple[int, Record]], colour: str) -> None:
             whiskers = {"color": "black", "elinewidth": 0.9, "capsize": 1.8, "capthick": 0.9}
             axes.errorbar(ratio, y, xerr=[[max(0.0, ratio - low)], [max(0.0, high - ratio)]], fmt="none", **whiskers)
         told = row["p_holm"] is None or row["p_holm"] < 0.05
-        change = percent(ratio) if ratio >= 10 else f"{percent(ratio)} %"
-        style = {"va": "center", "fontsize": 6, "color": "black" if told else PALE}
-        axes.annotate(change, (max(1.0, ratio, high), y), (3, 0), textcoords="offset points", **style)
+        change = (percent(ratio) if ratio >= 10 else f"{percent(ratio)} %").replace("-", MINUS)
+        style = {"va": "center", "fontsize": TEXT_PT, "textcoords": "offset points"}
+        axes.annotate(change if told else f"({change})", (max(1.0, ratio, high), y), (3, 0), **style)
         ends += [low, high]
     axes.axvline(1, color="black", linewidth=0.8)
     low, high = min(ends), max(ends)
     if high / low > WIDE:
         logarithmic(axes, "x")
         room = high / low
-        axes.set_xlim(low / room**0.05, high * room**0.45)  # for the numbers
+        axes.set_xlim(low / room**0.05, high * room**0.55)  # for the numbers
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if room < 30 else (1.0,)))
     else:
         room = max(high - low, 0.02)
-        axes.set_xlim(low - 0.05 * room, high + 0.45 * room)
+        axes.set_xlim(low - 0.05 * room, high + 0.55 * room)
         axes.xaxis.set_major_locator(MaxNLocator(4))

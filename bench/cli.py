@@ -115,6 +115,7 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
     """Write the CSV files and the figures of all that was run of this plan, and print the tables of these rows."""
     from .experiment import ExperimentError
     from .figures import draw_figures
+    from .latex import write_latex
     from .paired import paired
     from .runner import outdated, rows_of
     from .store import load_runs
@@ -127,12 +128,13 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
     differences = paired(every, plan.comparisons(), plan.compare)
     try:
         write_table(every, folder / "table.csv")
+        write_latex(every, folder / "table.tex")
         write_consistency(every, folder / "consistency.csv")
         write_paired(differences, folder / "paired.csv")
         figures = draw_figures(every, folder, differences)
     except OSError as error:
         raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
-    _say(f"{folder}: runs.sqlite, table.csv, consistency.csv, paired.csv, {len(figures)} figures")
+    _say(f"{folder}: runs.sqlite, table.csv, table.tex, consistency.csv, paired.csv, {len(figures)} figures")
     shown = set(zip(rows["log"], rows["label"], strict=True))
     print_table(rows, differences=[row for row in differences if (row["log"], row["label"]) in shown])
     standing, renewed = rows.attrs["standing"], rows.attrs["renewed"]

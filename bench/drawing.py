@@ -1,4 +1,8 @@
-"""How every figure looks: one look per estimator, panels, axes, and the files they are saved as."""
+"""How every figure looks: one look per estimator, panels, axes, legends, and the files they are saved as.
+
+Figures are made for a journal's page: one or two columns wide, letters of 7 and 8 points, TrueType fonts in the PDF.
+What colour tells is told again by marker or dash, for readers of grey prints.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,11 @@ import math
 from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Literal, NamedTuple
+from textwrap import fill, wrap
+from typing import NamedTuple
 
 from matplotlib import rc_context
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -20,7 +26,14 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
-WIDTH_IN = 7.2
+COLUMN_IN, WIDTH_IN, PAGE_IN = 3.5, 7.16, 8.8
+"""One column of a journal's page, both, and its height."""
+TITLE_PT, TEXT_PT = 8, 7
+LETTER_IN = 0.6 / 72
+"""Width of a letter per point of its size, on the safe side."""
+DPI = 300
+LONGEST = 46
+"""A label with more letters than this goes on in another line of the legend."""
 
 
 class Look(NamedTuple):
@@ -32,9 +45,9 @@ class Look(NamedTuple):
 
 
 def looks_of(labels: Sequence[str]) -> dict[str, Look]:
-    """Give each label a look; no two share colour and marker until there are 64."""
+    """Give each label a look; no two share colour and marker until there are 64, colour and dash until there are 32."""
     markers = [m for shift in range(len(MARKERS)) for m in MARKERS[shift:] + MARKERS[:shift]]
-    dashes = [dash for dash in DASHES for _ in PALETTE]
+    dashes = [DASHES[(k + k // len(PALETTE)) % len(DASHES)] for k in range(len(PALETTE) * len(DASHES))]
     return {
         label: Look(*look)
         for label, look in zip(labels, zip(cycle(PALETTE), cycle(markers), cycle(dashes)), strict=False)
@@ -52,14 +65,44 @@ def empty_figure(
     """Return a figure that needs no display, and its axes row by row; `heights` are those of the rows to each other."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
-    with rc_context({"axes.labelsize": 8, "axes.titlesize": 9}):
+    with rc_context({"axes.labelsize": TITLE_PT, "axes.titlesize": TITLE_PT, "font.size": TEXT_PT}):
         grid = figure.subplots(lines, columns, squeeze=False, sharex=share_x, height_ratios=heights)
     panels: list[Axes] = list(grid.ravel())
     for axes in panels:
-        axes.tick_params(labelsize=7)
+        axes.tick_params(labelsize=TEXT_PT)
         axes.grid(alpha=0.25, linewidth=0.5)
         axes.spines[["top", "right"]].set_visible(False)
     return figure, panels
+
+
+def plain(text: str) -> str:
+    """Return a text as matplotlib shows it as it stands: $ is no mathematics, and _ before a label does not hide it."""
+    return text.replace("$", r"\$").replace("_", " _", 1) if text.startswith("_") else text.replace("$", r"\$")
+
+
+def narrow(text: str, letters: int, lines: int = 3) -> str:
+    """Return a text in lines of so many letters, and of so many lines, as matplotlib shows it as it stands."""
+    return plain("\n".join(wrap(text, letters, max_lines=lines, placeholder=" …")))
+
+
+def title_above(figure: Figure, title: str) -> None:
+    """Put a title above all panels, in as many lines as it needs."""
+    letters = int(figure.get_figwidth() / (TITLE_PT * LETTER_IN))
+    figure.suptitle("\n".join(plain(fill(line, letters)) for line in title.splitlines()), fontsize=TITLE_PT)
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist], most: int = 4) -> None:
+    """Put a legend below all panels, in as many columns as have room, and let the figure grow by it."""
+    names = [fill(str(handle.get_label()), LONGEST) for handle in handles]
+    for artist, name in zip(handles, names, strict=True):
+        artist.set_label(name)
+    longest = max((len(line) for name in names for line in name.splitlines()), default=0)
+    columns = min(most, max(1, int(figure.get_figwidth() / (0.5 + longest * TEXT_PT * LETTER_IN))))
+    lines = sum(max(name.count("\n") + 1 for name in names[k : k + columns]) for k in range(0, len(names), columns))
+    figure.set_figheight(figure.get_figheight() + 0.1 + lines * 1.7 * TEXT_PT / 72)
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=TEXT_PT, handlelength=2.6
+    )
 
 
 def logarithmic(axes: Axes, which: str) -> None:
@@ -75,16 +118,27 @@ def logarithmic(axes: Axes, which: str) -> None:
         axis.set_minor_locator(NullLocator())
 
 
-def handle(label: str, marker: str, colour: str, filled: bool, line: Literal["none", "-", "--"] = "none") -> Line2D:
+def handle(
+    label: str, marker: str, colour: str, filled: bool, line: str | tuple[int, tuple[float, ...]] = "none"
+) -> Line2D:
     """Return what stands for an estimator in a legend."""
     face = colour if filled else "white"
-    return Line2D([], [], marker=marker, color=colour, markerfacecolor=face, linestyle=line, label=label)
+    style = {"marker": marker, "markersize": 4.5, "markerfacecolor": face, "linestyle": line, "linewidth": 1.0}
+    return Line2D([], [], color=colour, label=plain(label), **style)
+
+
+def look_handle(label: str, look: Look) -> Line2D:
+    """Return what stands in a legend for an estimator that is drawn as a line with markers."""
+    return handle(label, look.marker, look.colour, True, look.dash)
 
 
 def save(figure: Figure, stem: Path) -> list[Path]:
-    """Write a figure as PDF and PNG and return the files."""
+    """Write a figure as PDF, with its fonts as TrueType, and as PNG, and return the files."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     files = [Path(f"{stem}.pdf"), Path(f"{stem}.png")]
-    for file in files:
-        figure.savefig(file, dpi=160, metadata={"CreationDate": None} if file.suffix == ".pdf" else {})
+    with rc_context({"pdf.fonttype": 42}):
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # it has settled: once is enough for both
+        for file in files:
+            figure.savefig(file, dpi=DPI, metadata={"CreationDate": None} if file.suffix == ".pdf" else {})
     return files

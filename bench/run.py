@@ -45,6 +45,7 @@ from .metrics import (
     segment_errors,
     state_errors,
 )
+from .step_time import step_histogram
 
 Status: TypeAlias = Literal["done", "diverged", "failed"]
 
@@ -558,8 +559,8 @@ def _of_sensor(result: Result, sensor: str) -> NDArray[Any]:
     return nis[np.isin(nis["kind"], [kind for kind, name in enumerate(SENSOR) if name == sensor])]
 
 
-def costs(result: Result) -> dict[str, float | None]:
-    """Return every cost of COSTS that a result knows, by name; None where it came to no step."""
+def costs(result: Result) -> dict[str, float | str | None]:
+    """Return every cost of COSTS that a result knows, by name, and its `step_histogram`; none where it has no step."""
     if not len(result.step_ns):
         return {}
     median_us, p99_us, max_us = (float(q) / 1e3 for q in np.percentile(result.step_ns, [50, 99, 100]))
@@ -573,6 +574,7 @@ def costs(result: Result) -> dict[str, float | None]:
         "total_s": total_s,
         "real_time_factor": result.duration_s / total_s,
         "us_per_imu_sample": 1e6 * total_s / max(result.imu_samples, 1),
+        "step_histogram": step_histogram(result.step_ns),
     }
 
 

@@ -40,6 +40,9 @@ HONESTY = {
     "nees_at": "TEXT",  # JSON: NEES by block at times fixed beforehand, see `consistency.nees_at`
     "nis_dof": "TEXT",  # JSON: degrees of freedom of each sensor's NIS
 }
+TIMES = {
+    "step_histogram": "TEXT",  # JSON: how many steps took how long, see `step_time.step_histogram`
+}
 ORIGIN = {
     "identity": "TEXT",  # see `ledger.identity`
     "estimator": "TEXT",
@@ -54,7 +57,7 @@ ORIGIN = {
     "versions": "TEXT",  # JSON
     "machine": "TEXT",  # JSON
 }
-COLUMNS = NAMES | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | ORIGIN
+COLUMNS = NAMES | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | TIMES | ORIGIN
 RENAMED = {"anees_position": "nees_position"}
 """Columns that an older version called otherwise."""
 SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"

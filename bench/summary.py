@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable, Sequence
+from itertools import count
 from statistics import fmean, median
 from typing import Any, TypeAlias
 
@@ -50,6 +52,9 @@ COUNTS = {
 }
 """What estimators did with readings that came late or between keyframes; summed over seeds."""
 
+UNFINISHED = ("diverged", "failed", "absent")
+"""How a run ends that is not done."""
+
 OUTLIERS = "outliers_"
 """Counts of this prefix say how many readings an estimator took for outliers, or weighed down."""
 
@@ -69,16 +74,31 @@ def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Rec
     return found
 
 
+def file_names(names: Iterable[str]) -> dict[str, str]:
+    """Return for each name one that a file, or a LaTeX label, may have; no two differ in capitals alone."""
+    found: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)
+        taken = {other.lower() for other in found.values()}
+        numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
+        found[name] = next(one for one in numbered if one.lower() not in taken)
+    return found
+
+
 def summarise(rows: pd.DataFrame) -> list[Record]:
     """Return one record per log, estimator and output, over the seeds that came to their end.
 
     Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES, coverage are means; of
-    costs, the median is taken. `runs` and `done` say over how many; where none is done, the numbers are None. `anees_*`
-    is the mean over the fixed times of `consistency`, by degree of freedom, with the number of those times at which it
-    lies above and below its interval. `start` says where the priors came from, each way once.
+    costs, the median is taken. `runs` and `done` say over how many, `diverged`, `failed` and `absent` what became of
+    the rest; where none is done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, by
+    degree of freedom, with the number of those times at which it lies above and below its interval. `start` says where
+    the priors came from, each way once.
     """
     every = records(rows)
-    runs = {key: len(groups(of, "seed")) for key, of in groups(every, "log", "label").items()}
+    ends = {
+        key: [run[0]["status"] for run in groups(of, "seed").values()]
+        for key, of in groups(every, "log", "label").items()
+    }
     counted = COUNTS | {name: (name,) for name in _outliers(every)}
     summary = []
     for (log, label, output), group in groups(every, "log", "label", "output").items():
@@ -88,9 +108,10 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         starts = dict.fromkeys(row["start"] for row in group if row.get("start") is not None)
         record |= {"start": " | ".join(starts) or None}
         record |= _rpe_step(group)
-        record |= {"runs": runs[log, label], "done": len(done)}
-        record |= {count: sum(row[count] or 0 for row in done) for count in ("n_scored", "n_rpe")}
-        record |= {name: _pooled(done, name, count) for name, count in POOLED.items()}
+        record |= {"runs": len(ends[log, label]), "done": len(done)}
+        record |= {status: ends[log, label].count(status) for status in UNFINISHED}
+        record |= {n: sum(row[n] or 0 for row in done) for n in ("n_scored", "n_rpe")}
+        record |= {name: _pooled(done, name, n) for name, n in POOLED.items()}
         record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
         record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
         record |= _over_floor(done)
@@ -107,9 +128,9 @@ def _rpe_step(group: Sequence[Record]) -> Record:
     return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
 
 
-def _pooled(done: Sequence[Record], name: str, count: str) -> float | None:
+def _pooled(done: Sequence[Record], name: str, n: str) -> float | None:
     known = [row for row in done if row[name] is not None]
-    return pooled_rmse([row[name] for row in known], [row[count] for row in known]) if known else None
+    return pooled_rmse([row[name] for row in known], [row[n] for row in known]) if known else None
 
 
 def _over_seeds(statistic: Callable[[list[float]], float], done: Sequence[Record], name: str) -> float | None:

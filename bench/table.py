@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .floor_ratio import OVER
+from .intervals import summarise_with_intervals
 from .metrics import BLOCKS
 from .paired import FEWEST_SEEDS, PAIRED
 from .run import INNOVATIONS
@@ -47,8 +48,8 @@ CAUSE_WIDTH = 160
 
 
 def write_table(rows: pd.DataFrame, path: Path) -> None:
-    """Write what `summarise` returns as CSV; an absent number is an empty field."""
-    pd.DataFrame(summarise(rows)).to_csv(path, index=False)
+    """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field."""
+    pd.DataFrame(summarise_with_intervals(rows)).to_csv(path, index=False)
 
 
 def write_consistency(rows: pd.DataFrame, path: Path) -> None:
