@@ -330,7 +330,8 @@ def timing(
     only: Annotated[str | None, typer.Option(help="Pattern: a budget's or a benchmark's name.")] = None,
     short: Annotated[bool, typer.Option("--short", help="With --against: fewer benchmarks, a minute or two.")] = False,
     limit: Annotated[float, typer.Option(min=1.0, help="With --against: the ratio that is too slow.")] = 1.10,
-    rounds: Annotated[int, typer.Option(min=0, help="With --against: A B B A per pair of processes; 0: default.")] = 0,
+    pairs: Annotated[int, typer.Option(min=0, help="With --against: pairs of processes; 0: 5, or 3 if short.")] = 0,
+    rounds: Annotated[int, typer.Option(min=0, help="With --against: turns A B B A per pair; 0: 4, or 3.")] = 0,
     counters: Annotated[
         bool, typer.Option("--counters", help="Count work that no machine changes: factors, callbacks, allocations.")
     ] = False,
@@ -339,10 +340,10 @@ def timing(
 ) -> None:
     """Measure every budget; with --against, tell whether anything has become slower than in another revision."""
     with refusing_bad_input():
-        from .timing.command import print_budgets, print_comparison, print_counters
+        from .timing.command import print_budgets, print_comparison, print_counters  # noqa
 
         if against is not None:
-            good = print_comparison(against, only, short, limit, rounds, out)
+            good = print_comparison(against, only, short, limit, rounds, pairs, out)
         elif counters:
             good = print_counters(out)
         else:

@@ -1,0 +1,320 @@
+"""Is this revision slower than that one? An answer that a noisy machine does not change.
+
+Both revisions have a process each, and take turns, A B B A, so that whatever slows the machine slows both. Processor time
+is compared, for the neighbours' share of the clock is not ours. Two processes of the very same code still differ by some
+per cent, each for its whole life (where things lie in memory), which no taking turns removes: so there are several
+pairs of processes, and the interval is a bootstrap over pairs and, within them, over turns.
+
+The intervals hold for all benchmarks together (Bonferroni). What comes out slower than the limit is measured again,
+with twice as many new pairs, and only that decides: slower is what has its whole second interval above the limit.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..runner import THREAD_COUNTS
+from . import benchmarks
+from .benchmarks import Benchmark
+from .revision import PREFIX, TimingError, Tree, checked_out, share_compiled, working_tree
+
+Array = NDArray[np.float64]
+Verdict = Literal["slower", "slower?", "same", "faster", "new", "broken"]
+
+CONFIDENCE = 0.95
+"""Of all intervals together."""
+
+LEAST_S = 0.02
+"""A turn is repeated until it takes this long: shorter ones measure the clock."""
+
+RESAMPLES = 20_000
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured: pairs of processes, and turns A B B A of each."""
+
+    pairs: int
+    rounds: int
+
+
+FULL, SHORT = Effort(5, 4), Effort(3, 3)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One benchmark in both revisions.
+
+    Attributes:
+        name, group, unit: of the benchmark.
+        now_us, then_us: processor time per unit, the median over turns; None where it cannot run.
+        ratio, low, high: now over then, with its interval.
+        again: whether it was measured twice; the numbers are the second measurement's.
+        verdict: "slower": the whole interval is above the limit; "slower?": only the ratio is; "faster": the whole
+            interval is below 1 over the limit; "new": that revision cannot do it; "broken": this one cannot.
+        note: why it cannot run, or that it was not the same amount of work.
+    """
+
+    name: str
+    group: str
+    unit: str
+    verdict: Verdict
+    now_us: float | None = None
+    then_us: float | None = None
+    ratio: float | None = None
+    low: float | None = None
+    high: float | None = None
+    again: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All that was compared, with what and how."""
+
+    now: str
+    then: str
+    environment: str
+    limit: float
+    level: float
+    rows: tuple[Compared, ...]
+
+    @property
+    def failed(self) -> bool:
+        """Whether anything is slower, or cannot run any more."""
+        return any(row.verdict in ("slower", "broken") for row in self.rows)
+
+
+Progress = Callable[[str, float], None]
+"""Called with what is going on, and the share of all work that is done."""
+
+
+def compare(revision: str, chosen: Sequence[Benchmark], effort: Effort, limit: float, progress: Progress) -> Comparison:
+    """Compare the working tree with a revision.
+
+    Raises:
+        TimingError: there is no such revision, or nothing to run it with.
+    """
+    ours = working_tree()
+    with TemporaryDirectory(prefix=PREFIX) as temporary:
+        folder = Path(temporary)
+        progress(f"checking out {revision}", 0.0)
+        with checked_out(revision, folder) as theirs:
+            now = Side(ours, ours.packages(folder / "now"), folder / "inputs")
+            then = Side(theirs, theirs.packages(folder / "then"), folder / "inputs")
+            progress("writing logs", 0.02)
+            benchmarks.write_inputs(folder / "inputs")
+            units, broken = _warm_up(now, then, chosen, progress)
+            runnable = [each for each in chosen if each.name in units]
+            level = 1 - (1 - CONFIDENCE) / max(len(runnable), 1)
+            rows = _measure(now, then, runnable, units, effort, limit, level, progress)
+            slow = [each for each in runnable if (rows[each.name].ratio or 0.0) > limit]
+            if slow:
+                twice = Effort(2 * effort.pairs, effort.rounds)
+                second = _measure(now, then, slow, units, twice, limit, level, progress, again=True)
+                rows |= second
+    rows |= broken
+    return Comparison(
+        ours.name, theirs.name, theirs.environment, limit, level, tuple(rows[each.name] for each in chosen)
+    )
+
+
+@dataclass(frozen=True)
+class Side:
+    """A tree with the folder that leads to its packages; processes of it can be started."""
+
+    tree: Tree
+    packages: Path
+    inputs: Path
+
+    def start(self) -> Worker:
+        """Start a process."""
+        here = Path(__file__).parent
+        command = [str(self.tree.python), "-P", str(here / "worker.py")]
+        command += [str(self.packages), str(here / "benchmarks.py"), str(self.inputs)]
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        environment |= dict.fromkeys(THREAD_COUNTS, "1") | {"PYTHONHASHSEED": "0"}
+        return Worker(self.tree.name, command, environment)
+
+
+class Worker:
+    """A process that times benchmarks, see `worker`."""
+
+    def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        self._name = name
+        self._process = subprocess.Popen(
+            command,
+            env=dict(environment),
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is ours to handle
+        )
+
+    def send(self, **command: Any) -> None:
+        """Hand over a command; the answer is there to be received."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(command) + "\n")
+            self._process.stdin.flush()
+        except OSError:
+            return  # `receive` says so
+
+    def receive(self) -> dict[str, Any]:
+        """Return the answer to the last command.
+
+        Raises:
+            TimingError: the process has died.
+        """
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise TimingError(
+                f"{self._name}: its process died (exit code {self._process.wait()}); its last words are above"
+            )
+        return json.loads(line)
+
+    def ask(self, **command: Any) -> dict[str, Any]:
+        """Send a command and return the answer."""
+        self.send(**command)
+        return self.receive()
+
+    def close(self) -> None:
+        """End the process, whatever it is doing."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            assert pipe is not None
+            try:
+                pipe.close()
+            except BrokenPipeError:
+                continue
+
+
+@contextmanager
+def _started(*sides: Side) -> Iterator[list[Worker]]:
+    workers: list[Worker] = []
+    try:
+        workers += [side.start() for side in sides]
+        yield workers
+    finally:
+        for worker in workers:
+            worker.close()
+
+
+def _warm_up(
+    now: Side, then: Side, chosen: Sequence[Benchmark], progress: Progress
+) -> tuple[dict[str, int], dict[str, Compared]]:
+    """Compile everything in both trees; return how often each benchmark repeats, and the rows of those that cannot run.
+
+    The processes that compiled end here: all that are timed load what was compiled, and are alike in that.
+    """
+    answers: list[dict[str, dict[str, Any]]] = []
+    for side in (now, then):
+        same = side is then and share_compiled(now.tree.root, then.tree.root)
+        with _started(side) as (worker,):
+            found = {}
+            for k, each in enumerate(chosen):
+                what = "loading" if same else "compiling"
+                progress(f"{what} {each.name} of {side.tree.name}", 0.05 + 0.05 * (len(answers) + k / len(chosen)))
+                found[each.name] = worker.ask(prepare=each.name)
+        answers.append(found)
+    repeats, rows = {}, {}
+    for each in chosen:
+        ours, theirs = (found[each.name] for found in answers)
+        if "lacks" in ours:
+            rows[each.name] = Compared(each.name, each.group, each.unit, "broken", note=ours["lacks"])
+        elif "lacks" in theirs:
+            rows[each.name] = Compared(each.name, each.group, each.unit, "new", note=theirs["lacks"])
+        else:
+            repeats[each.name] = math.ceil(LEAST_S / max(min(ours["cpu_s"], theirs["cpu_s"]), 1e-6))
+    return repeats, rows
+
+
+def _measure(
+    now: Side,
+    then: Side,
+    chosen: Sequence[Benchmark],
+    repeats: Mapping[str, int],
+    effort: Effort,
+    limit: float,
+    level: float,
+    progress: Progress,
+    again: bool = False,
+) -> dict[str, Compared]:
+    """Let both sides take turns at every benchmark, and compare."""
+    seconds = {each.name: np.zeros((effort.pairs, effort.rounds, 4)) for each in chosen}
+    units: dict[str, tuple[int, int]] = {}
+    for pair in range(effort.pairs):
+        with _started(now, then) as workers:
+            for each in chosen:
+                for worker in workers:
+                    worker.send(prepare=each.name)
+                found = [worker.receive() for worker in workers]
+                if any("lacks" in one for one in found):
+                    raise TimingError(f"{each.name}: ran once and then did not: {found}")
+                units[each.name] = (found[0]["units"], found[1]["units"])
+            for turn in range(effort.rounds):
+                done = (pair + turn / effort.rounds) / effort.pairs
+                progress(f"{'measuring again' if again else 'measuring'}, pair {pair + 1}", 0.15 + 0.85 * done)
+                for each in chosen:
+                    order = workers if turn % 2 == 0 else workers[::-1]
+                    for k, worker in enumerate((order[0], order[1], order[1], order[0])):
+                        answer = worker.ask(time=each.name, repeat=repeats[each.name])
+                        place = (0, 2, 3, 1)[k] if turn % 2 == 0 else (2, 0, 1, 3)[k]
+                        seconds[each.name][pair, turn, place] = answer["cpu_s"]
+    rows = {}
+    for each in chosen:
+        ratio, low, high = ratio_of(seconds[each.name], level)
+        ours_us, theirs_us = (
+            float(np.median(seconds[each.name][:, :, of])) / n * 1e6
+            for of, n in zip((slice(0, 2), slice(2, 4)), units[each.name], strict=True)
+        )
+        note = "" if len(set(units[each.name])) == 1 else "{} units now, {} then".format(*units[each.name])
+        verdict = verdict_of(ratio, low, high, limit)
+        rows[each.name] = Compared(
+            each.name, each.group, each.unit, verdict, ours_us, theirs_us, ratio, low, high, again, note
+        )
+    return rows
+
+
+def verdict_of(ratio: float, low: float, high: float, limit: float) -> Verdict:
+    """Return what a ratio with its interval says."""
+    if low > limit:
+        return "slower"
+    if ratio > limit:
+        return "slower?"
+    return "faster" if high < 1 / limit else "same"
+
+
+def ratio_of(seconds: Array, level: float, seed: int = 0) -> tuple[float, float, float]:
+    """Return now over then, and its bootstrap interval.
+
+    The median over turns, whose logarithm is averaged over pairs of processes; pairs are drawn again, and turns within
+    each pair.
+
+    Args:
+        seconds: (pairs, rounds, 4); the last axis is now, now, then, then.
+        level: of the interval.
+        seed: of the draws.
+    """
+    logs = np.log((seconds[..., 0] + seconds[..., 1]) / (seconds[..., 2] + seconds[..., 3]))
+    pairs, rounds = logs.shape
+    rng = np.random.default_rng(seed)
+    drawn = rng.integers(pairs, size=(RESAMPLES, pairs))
+    turns = rng.integers(rounds, size=(RESAMPLES, pairs, rounds))
+    means = np.median(logs[drawn[:, :, None], turns], axis=2).mean(axis=1)
+    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
+    return math.exp(np.median(logs, axis=1).mean()), math.exp(low), math.exp(high)
