@@ -340,14 +340,14 @@ def timing(
 ) -> None:
     """Measure every budget; with --against, tell whether anything has become slower than in another revision."""
     with refusing_bad_input():
-        from .timing.command import print_budgets, print_comparison, print_counters  # noqa
+        from .timing import command
 
         if against is not None:
-            good = print_comparison(against, only, short, limit, rounds, pairs, out)
+            good = command.print_comparison(against, only, short, limit, rounds, pairs, out)
         elif counters:
-            good = print_counters(out)
+            good = command.print_counters(out)
         else:
-            good = print_budgets(only, out) or not strict
+            good = command.print_budgets(only, out) or not strict
     if not good:
         raise typer.Exit(SOME_FAILED)
 

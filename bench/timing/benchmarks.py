@@ -1,9 +1,9 @@
 """What is timed: small pieces of real work, by name and group.
 
-`pytest tests/timing` times these, `fathom timing --against REV` compares them with those of another revision. There this
-very file is loaded into both revisions' packages, so that both do the same work. It therefore asks them for what others
-rely on (DESIGN, section 10) wherever it can, and for anything only inside of a benchmark: a revision that lacks it lacks
-that benchmark alone. Logs and stores are written once, by `write_inputs`, and read by both.
+`pytest tests/timing` times these, `fathom timing --against REV` compares them with those of another revision. There
+this very file is loaded into both revisions' packages, so that both do the same work. It therefore asks them for what
+others rely on (DESIGN, section 10) wherever it can, and for anything only inside of a benchmark: a revision that lacks
+it lacks that benchmark alone. Logs and stores are written once, by `write_inputs`, and read by both.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ ROWS = {
 }
 
 
-def write_inputs(folder: Path) -> None:
-    """Write the logs, the track and the store of runs that the benchmarks read."""
+def write_inputs(folder: Path, chosen: Iterable[Benchmark]) -> None:
+    """Write the logs, the track and, for the report, the store of runs that these benchmarks read."""
     from ...datasets import Scenario, simulate
     from ...datasets.folder import write_folder
     from ..experiment import Experiment
@@ -84,7 +84,8 @@ def write_inputs(folder: Path) -> None:
         if name == "short":
             write_folder(log, folder / "short as csv", "csv")
     _tracks()[1].to_tum(folder / "track.tum")
-    run_experiment(Experiment.from_dict(ROWS), out=folder, jobs=1)
+    if any(each.group == "report" for each in chosen):
+        run_experiment(Experiment.from_dict(ROWS), out=folder, jobs=1)
 
 
 @cache

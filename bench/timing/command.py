@@ -51,8 +51,8 @@ def print_comparison(
         box=box.SIMPLE_HEAD,
         title=f"{found.now} over {found.then}",
         caption=(
-            f"processor time, µs; {effort.pairs} pairs of processes, {effort.rounds} turns A B B A each, twice the pairs "
-            f"where marked *; slower: the whole interval is above {limit:g}\n{found.environment}"
+            f"processor time, µs; {effort.pairs} pairs of processes, {effort.rounds} turns A B B A each, twice the "
+            f"pairs where marked *; slower: the whole interval is above {limit:g}\n{found.environment}"
         ),
         caption_justify="left",
     )

@@ -1,9 +1,10 @@
 """Is this revision slower than that one? An answer that a noisy machine does not change.
 
-Both revisions have a process each, and take turns, A B B A, so that whatever slows the machine slows both. Processor time
-is compared, for the neighbours' share of the clock is not ours. Two processes of the very same code still differ by some
-per cent, each for its whole life (where things lie in memory), which no taking turns removes: so there are several
-pairs of processes, and the interval is a bootstrap over pairs and, within them, over turns.
+Both revisions have a process each, and take turns, A B B A, so that whatever slows the machine slows both. Processor
+time is compared, for the neighbours' share of the clock is not ours, and of two turns of a side the faster one, for
+noise only adds. Two processes of the very same code still differ by some per cent, each for its whole life (where things
+lie in memory), which no taking turns removes: so there are several pairs of processes, and the interval is a bootstrap
+over pairs and, within them, over turns.
 
 The intervals hold for all benchmarks together (Bonferroni). What comes out slower than the limit is measured again,
 with twice as many new pairs, and only that decides: slower is what has its whole second interval above the limit.
@@ -115,7 +116,7 @@ def compare(revision: str, chosen: Sequence[Benchmark], effort: Effort, limit: f
             now = Side(ours, ours.packages(folder / "now"), folder / "inputs")
             then = Side(theirs, theirs.packages(folder / "then"), folder / "inputs")
             progress("writing logs", 0.02)
-            benchmarks.write_inputs(folder / "inputs")
+            benchmarks.write_inputs(folder / "inputs", chosen)
             units, broken = _warm_up(now, then, chosen, progress)
             runnable = [each for each in chosen if each.name in units]
             level = 1 - (1 - CONFIDENCE) / max(len(runnable), 1)
@@ -310,7 +311,7 @@ def ratio_of(seconds: Array, level: float, seed: int = 0) -> tuple[float, float,
         level: of the interval.
         seed: of the draws.
     """
-    logs = np.log((seconds[..., 0] + seconds[..., 1]) / (seconds[..., 2] + seconds[..., 3]))
+    logs = np.log(seconds[..., :2].min(axis=-1) / seconds[..., 2:].min(axis=-1))
     pairs, rounds = logs.shape
     rng = np.random.default_rng(seed)
     drawn = rng.integers(pairs, size=(RESAMPLES, pairs))

@@ -69,7 +69,7 @@ def working_tree() -> Tree:
 
 @contextmanager
 def checked_out(revision: str, folder: Path) -> Iterator[Tree]:
-    """Give a revision as a worktree within `folder`, a temporary one; the worktree is gone afterwards, whatever happens.
+    """Give a revision as a worktree within `folder`, a temporary one; it is gone afterwards, whatever happens.
 
     Raises:
         TimingError: there is no such revision, or its dependencies cannot be installed.
@@ -117,7 +117,7 @@ def share_compiled(ours: Path, theirs: Path) -> bool:
 
 
 def _environment(tree: Path, folder: Path) -> tuple[Path, str]:
-    """Return the interpreter for a tree, and why: this one where all that a run imports is pinned alike, else a new one."""
+    """Return the interpreter for a tree, and why: this one where all that a run imports is pinned alike."""
     if _dependencies(tree) == _dependencies(ROOT):
         return Path(sys.executable), "this environment: the same dependencies, pinned alike"
     python = folder / "bin" / "python"

@@ -2,8 +2,8 @@
 
     python -P worker.py PACKAGES BENCHMARKS INPUTS
 
-reads a command per line, {"prepare": NAME} or {"time": NAME, "repeat": N}, and answers each by a line of JSON. The file of
-the benchmarks may be another revision's than the packages.
+reads a command per line, {"prepare": NAME} or {"time": NAME, "repeat": N}, and answers each by a line of JSON. The file
+of the benchmarks may be another revision's than the packages.
 """
 
 from __future__ import annotations
