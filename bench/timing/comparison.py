@@ -2,9 +2,9 @@
 
 Both revisions have a process each, and take turns, A B B A, so that whatever slows the machine slows both. Processor
 time is compared, for the neighbours' share of the clock is not ours, and of two turns of a side the faster one, for
-noise only adds. Two processes of the very same code still differ by some per cent, each for its whole life (where things
-lie in memory), which no taking turns removes: so there are several pairs of processes, and the interval is a bootstrap
-over pairs and, within them, over turns.
+noise only adds. Two processes of the very same code still differ by some per cent, each for its whole life (where
+things lie in memory), which no taking turns removes: so there are several pairs of processes, and the interval is a
+bootstrap over pairs and, within them, over turns.
 
 The intervals hold for all benchmarks together (Bonferroni). What comes out slower than the limit is measured again,
 with twice as many new pairs, and only that decides: slower is what has its whole second interval above the limit.

@@ -1,0 +1,294 @@
+"""The budgets of DESIGN, section 8: ratios, each measured within one command, the two sides taking turns.
+
+Where both sides are one thread of ours, processor time is compared, so that a busy machine does not matter much.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ...datasets import Log, Scenario, simulate
+from ...datasets.epochs import cut
+from ...datasets.folder import write_folder
+from ...estimators import create
+from ..experiment import Experiment
+from ..metrics import ate
+from ..run import run_log, score_ticks, scores, warm_up
+from ..runner import Task, run_all
+from . import evo
+
+LAGS_S = (3.0, 10.0, 30.0)
+CHEAPER = ({}, {"wildfire": 0.1}, {"wildfire": 0.1, "relinearize": [0.05, 1e3, 0.5, 10.0]})
+"""Settings of `fls`, each cheaper than the one before."""
+
+RUNS, WARM_RUNS = 100, 10
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Ratios, one per round, and what is to be said of them."""
+
+    ratios: tuple[float, ...]
+    note: str = ""
+
+    @property
+    def median(self) -> float:
+        """What counts."""
+        return float(np.median(self.ratios))
+
+
+@dataclass(frozen=True)
+class Budget:
+    """One row of section 8.
+
+    Attributes:
+        name: what over what.
+        limit: the ratio that is asked for.
+        least: whether it is the least allowed (else the most).
+        measure: measures it.
+        obstacle: what stands in the way, where it is known to be missed.
+    """
+
+    name: str
+    limit: float
+    least: bool
+    measure: Callable[[], Measured]
+    obstacle: str = ""
+
+    def holds(self, measured: Measured) -> bool:
+        """Return whether the median keeps to the limit."""
+        return measured.median >= self.limit if self.least else measured.median <= self.limit
+
+
+def take_turns(over: Callable[[], object], under: Callable[[], object], rounds: int) -> tuple[float, ...]:
+    """Return the ratio of two calls' processor times, one per round A B B A, of the faster of each two."""
+
+    def spent(call: Callable[[], object]) -> float:
+        started = time.process_time()
+        call()
+        return time.process_time() - started
+
+    ratios = []
+    for _ in range(rounds):
+        a, b, c, d = spent(over), spent(under), spent(under), spent(over)
+        ratios.append(min(a, d) / min(b, c))
+    return tuple(ratios)
+
+
+def _mission(duration_s: float) -> Log:
+    return simulate(Scenario(mission="lawnmower", duration_s=duration_s, imu="tactical"), seed=4)
+
+
+_simulated = cache(_mission)
+
+
+def _stepping(log: Log, name: str, **options: Any) -> Callable[[], Any]:
+    """Return what takes every step of a log."""
+    estimator, epochs = create(name, **options), cut(log, score_ticks(log, 1.0)).epochs
+
+    def steps() -> Any:
+        one = estimator.begin(log.prior, log.rig)
+        for epoch in epochs:
+            one.step(epoch)
+        return one
+
+    steps()
+    return steps
+
+
+# -- the rows ---------------------------------------------------------------------------------------------------------
+
+
+def filter_against_filterpy() -> Measured:
+    """Measure how much longer `eskf-filterpy` takes than `eskf`."""
+    log = _simulated(60.0)
+    return Measured(take_turns(_stepping(log, "eskf-filterpy"), _stepping(log, "eskf"), 5))
+
+
+def python_factor() -> Measured:
+    """Measure linearising our displacement factor over GTSAM's of a point in two frames, native: both 3 × 12."""
+    import gtsam
+    from gtsam.symbol_shorthand import L, X
+
+    from ...estimators.gtsam_border import displacement_factor, insert_state
+
+    log = _simulated(60.0)
+    assert log.prior is not None
+    values = gtsam.Values()
+    for i in range(2):
+        insert_state(values, i, log.prior.state, log.rig.imu.R_BS)
+        values.insert(L(i), np.ones(3))
+    cov = 1e-4 * (np.eye(3) + 0.1)
+    ours = displacement_factor(0, 1, np.ones(3), cov)
+    native = gtsam.ReferenceFrameFactorPoint3Pose3(L(0), X(0), L(1), gtsam.noiseModel.Gaussian.Covariance(cov))
+    assert {factor.linearize(values).jacobian()[0].shape for factor in (ours, native)} == {(3, 12)}
+
+    def many(factor: Any) -> None:
+        for _ in range(5000):
+            factor.linearize(values)
+
+    many(ours), many(native)
+    return Measured(take_turns(partial(many, ours), partial(many, native), 7))
+
+
+def window_against_fls(lag_s: float) -> Measured:
+    """Measure how much longer than `window` the cheapest setting of `fls` takes whose RMSE is within 1 % of its."""
+    log = _simulated(90.0)
+    best = ate(log.truth, run_log(log, create("window", lag_s=lag_s)).online).rmse_m
+    good = []
+    for options in CHEAPER:
+        result = run_log(log, create("fls", lag_s=lag_s, **options))
+        if result.status == "done" and ate(log.truth, result.online).rmse_m <= 1.01 * best:
+            good.append((int(result.step_ns.sum()), options))
+    assert good, "no setting of fls is as good"
+    options = min(good, key=lambda each: each[0])[1]
+    said = ", ".join(f"{name} {value}" for name, value in options.items()) or "its defaults"
+    ratios = take_turns(_stepping(log, "fls", lag_s=lag_s, **options), _stepping(log, "window", lag_s=lag_s), 3)
+    return Measured(ratios, f"cheapest fls: {said}")
+
+
+def harness_against_steps() -> Measured:
+    """Measure all but `eskf`'s steps, from a log of ten minutes in memory to its scores, over those steps."""
+    log, estimator, ratios = _simulated(600.0), create("eskf"), []
+    warm_up(estimator)
+    for _ in range(9):
+        started = time.perf_counter_ns()
+        result = run_log(log, estimator)
+        assert result.online is not None
+        scores(log, result.online)
+        total_ns = time.perf_counter_ns() - started
+        steps_ns = int(result.step_ns.sum()) + result.finish_ns
+        ratios.append((total_ns - steps_ns) / steps_ns)
+    return Measured(tuple(ratios))
+
+
+def simulation_against_filter() -> Measured:
+    """Measure simulating ten minutes over running `eskf` on them."""
+    log, estimator = _simulated(600.0), create("eskf")
+    warm_up(estimator)
+    return Measured(take_turns(partial(_mission, 600.0), partial(run_log, log, estimator), 5))
+
+
+def two_workers_against_one() -> Measured:
+    """Measure how many more of 100 runs two processes do at a time than one does, each having done some before."""
+    plan = {
+        "name": "workers",
+        "description": "Many runs.",
+        "logs": [{"scenario": {"duration_s": 60.0}}],
+        "estimators": [{"name": "eskf"}],
+        "seeds": RUNS + WARM_RUNS,
+    }
+    experiment = Experiment.from_dict(plan)
+
+    def rate(jobs: int, folder: Path) -> float:
+        (folder / "trajectories").mkdir(parents=True)
+        tasks, started = [Task(experiment, run, folder) for run in experiment.runs()], 0.0
+        for done, _ in enumerate(run_all(tasks, jobs), 1):
+            if done == WARM_RUNS:
+                started = time.perf_counter()
+        return RUNS / (time.perf_counter() - started)
+
+    ratios = []
+    with TemporaryDirectory() as temporary:
+        for k in range(2):
+            one, two = (rate(jobs, Path(temporary) / f"{jobs} {k}") for jobs in (1, 2))
+            ratios.append(two / one)
+    load = os.getloadavg()[0]
+    return Measured(tuple(ratios), f"{os.cpu_count()} cores; load at the end, our own part included: {load:.1f}")
+
+
+def memory_of_an_hour() -> Measured:
+    """Measure the peak memory of opening and running an hour, over that of our imports, by the log's own arrays."""
+    log = _mission(3600.0)
+    imports = (
+        "from fathom.bench import run_log; from fathom.datasets import open_log; from fathom.estimators import create"
+    )
+    run = "import sys; assert run_log(open_log(sys.argv[1]), create('eskf')).status == 'done'"
+    own = array_bytes(log)
+    with TemporaryDirectory() as temporary:
+        folder = str(write_folder(log, Path(temporary) / "hour"))
+        empty, full = (_peak_bytes(code, folder) for code in (imports, f"{imports}; {run}"))
+    return Measured(((full - empty) / own,), f"{own / 1e6:.0f} MB of arrays; {(full - empty) / 1e6:.0f} MB to run them")
+
+
+def array_bytes(value: Any) -> int:
+    """Return how many bytes the arrays of a log take."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if is_dataclass(value):
+        return sum(array_bytes(getattr(value, field.name)) for field in fields(value))
+    return sum(map(array_bytes, value.values())) if isinstance(value, dict) else 0
+
+
+PEAK = """
+try:
+    text = open("/proc/self/status").read()
+    peak = 1024 * int(text.split("VmHWM:")[1].split()[0])
+except OSError:
+    import resource
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(peak)
+"""
+
+
+def _peak_bytes(code: str, *arguments: str) -> int:
+    """Return the peak memory of a process that runs some code."""
+    command = [sys.executable, "-c", code + PEAK, *arguments]
+    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def help_against_numpy() -> Measured:
+    """Measure the processor time of `fathom --help` over that of importing numpy."""
+
+    def seconds(*arguments: str) -> float:
+        before = os.times()
+        subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
+        after = os.times()
+        return after.children_user + after.children_system - before.children_user - before.children_system
+
+    ask, load = partial(seconds, "-m", "fathom.bench.cli", "--help"), partial(seconds, "-c", "import numpy")
+    ask(), load()
+    return Measured(tuple(min(ask(), ask()) / min(load(), load()) for _ in range(5)))
+
+
+def scores_against_evo() -> Measured:
+    """Measure how much longer evo takes for ATE and RPE of 100,000 poses; where the two differ, the ratio is 0."""
+    compared = evo.compare(100_000)
+    note = f"they differ by {compared.largest_difference:.0e} at most"
+    if compared.largest_difference > evo.TOLERANCE:
+        return Measured((0.0,), f"not equal: {note}")
+    return Measured(compared.ratios, note)
+
+
+SAME_BLOCK = (
+    "both spend most of their time in the same compiled IMU block and in being called from Python, epoch by epoch; "
+    "only the update is filterpy's"
+)
+
+FROM_CPP = (
+    "GTSAM calls Python with its values and a list of Jacobians; fetching poses from it and handing arrays back costs "
+    "more than the native factor before our compiled lines begin"
+)
+
+BUDGETS: Sequence[Budget] = (
+    Budget("eskf-filterpy over eskf, same log", 50.0, True, filter_against_filterpy, SAME_BLOCK),
+    Budget("our Python factor over a native one, 3 × 12", 4.0, False, python_factor, FROM_CPP),
+    *(Budget(f"fls over window, lag {s:g} s", 5.0, True, partial(window_against_fls, s)) for s in LAGS_S),
+    Budget("harness over eskf's steps, 10 min", 0.5, False, harness_against_steps),
+    Budget("evo over ATE and RPE, 100,000 poses", 100.0, True, scores_against_evo),
+    Budget("simulate over eskf, 10 min", 2.0, False, simulation_against_filter),
+    Budget("two workers over one, 100 runs", 1.8, True, two_workers_against_one),
+    Budget("memory of 1 h over its arrays", 10.0, False, memory_of_an_hour),
+    Budget("fathom --help over import numpy", 4.0, False, help_against_numpy),
+)
