@@ -345,7 +345,7 @@ def timing(
         if against is not None:
             good = command.print_comparison(against, only, short, limit, rounds, pairs, out)
         elif counters:
-            good = command.print_counters(out)
+            good = command.print_counters(only, out)
         else:
             good = command.print_budgets(only, out) or not strict
     if not good:

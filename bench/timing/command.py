@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -51,8 +52,8 @@ def print_comparison(
         box=box.SIMPLE_HEAD,
         title=f"{found.now} over {found.then}",
         caption=(
-            f"processor time, µs; {effort.pairs} pairs of processes, {effort.rounds} turns A B B A each, twice the "
-            f"pairs where marked *; slower: the whole interval is above {limit:g}\n{found.environment}"
+            f"processor time, µs; {effort.pairs} pairs of processes, {effort.rounds} turns A B B A each, twice as "
+            f"many of both where marked *; slower: the whole interval is above {limit:g}\n{found.environment}"
         ),
         caption_justify="left",
     )
@@ -79,6 +80,68 @@ def print_comparison(
     return not slow
 
 
+def print_budgets(only: str | None, out: Path | None) -> bool:
+    """Measure every budget of DESIGN, section 8, print and save what came out, and return whether all hold."""
+    from .budgets import BUDGETS, Measured
+
+    chosen = select(BUDGETS, only)
+    found: list[tuple[Measured | None, str]] = []
+    with progress() as advance:
+        for k, budget in enumerate(chosen):
+            advance(budget.name, k / len(chosen))
+            try:
+                found.append((budget.measure(), ""))
+            except ModuleNotFoundError as error:
+                found.append((None, f"{error.name} is not installed: pip install 'fathom-bench[dev]'"))
+    table = Table(
+        *("what over what", "budget", "measured", "from – to", "verdict", "note"),
+        box=box.SIMPLE_HEAD,
+        caption="within this command: the median of rounds in which the two take turns, with the least and the largest",
+        caption_justify="left",
+    )
+    for column in table.columns[1:4]:
+        column.justify = "right"
+    rows = []
+    for budget, (measured, missing) in zip(chosen, found, strict=True):
+        limit = f"{'≥' if budget.least else '≤'} {budget.limit:g}"
+        if measured is None:
+            verdict, numbers, note = "not measured", ("–", "–"), missing
+        else:
+            verdict = "holds" if budget.holds(measured) else "missed"
+            numbers = (f"{measured.median:.3g}", f"{min(measured.ratios):.3g} – {max(measured.ratios):.3g}")
+            note = "; ".join(filter(None, (measured.note, budget.obstacle if verdict == "missed" else "")))
+        table.add_row(budget.name, limit, *numbers, verdict, note, style=COLOUR.get(verdict))
+        rows.append({"name": budget.name, "budget": limit, "verdict": verdict, "note": note})
+        rows[-1]["ratios"] = [] if measured is None else list(measured.ratios)
+    console().print(table)
+    save(out, {"budgets": rows})
+    return all(row["verdict"] == "holds" for row in rows)
+
+
+def print_counters(only: str | None, out: Path | None) -> bool:
+    """Print and save the counters of every estimator that has any; there is nothing that could fail in them."""
+    from .counters import COUNTED, COUNTERS, count
+
+    names = [name for name in COUNTED if only is None or fnmatch(name, only)]
+    if not names:
+        raise TimingError(f"--only {only!r} matches nothing; there are: {'; '.join(COUNTED)}")
+    found = {}
+    with progress() as advance:
+        for k, name in enumerate(names):
+            advance(name, k / len(names))
+            found[name] = count(name)
+    table = Table("", *(key.replace("_", "\n") for key in COUNTERS), box=box.SIMPLE_HEAD)
+    for name, counters in found.items():
+        table.add_row(name, *(f"{counters[key]:,.4g}" if key in counters else "–" for key in COUNTERS))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    console().print(table)
+    for key, meaning in COUNTERS.items():
+        print(f"{key}: {meaning}")
+    save(out, {"counters": found})
+    return True
+
+
 def select(known: Sequence[Named], only: str | None) -> list[Named]:
     """Return those whose name or group matches a pattern.
 
@@ -103,11 +166,17 @@ def save(out: Path | None, content: Mapping[str, Any]) -> None:
     if out is None:
         return
     of = provenance()
-    made = {"commit": of["commit_id"], "versions": json.loads(of["versions"]), "machine": json.loads(of["machine"])}
+    made = {"commit": of["commit_id"], "versions": json.loads(of["versions"]), "machine": machine()}
     try:
         out.write_text(json.dumps({**content, **made}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise TimingError(f"{out}: cannot be written ({error.strerror})") from None
+
+
+def machine() -> dict[str, Any]:
+    """Return what decides how fast a machine is, without its name."""
+    of = json.loads(provenance()["machine"])
+    return {"cpu": of["cpu"], "cores": of["cores"], "system": f"{platform.system()} {platform.machine()}"}
 
 
 @contextmanager
