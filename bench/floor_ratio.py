@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+import scipy  # its stats load when they are first asked for
 
 from ..datasets.state import POSITION, THETA, VELOCITY, Array, TimeArray
 from ..datasets.trajectory import Trajectory
@@ -116,7 +116,7 @@ def rmse_over_floor(
         return FloorRatio(ratio, None, None, level, len(e))
     if np.ptp(e / f) <= 1e-12 * ratio**2:  # every resample says the same
         return FloorRatio(ratio, ratio, ratio, level, len(e))
-    interval = stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         (e, f), _ratio, paired=True, vectorized=True, n_resamples=resamples, batch=1000, confidence_level=level,
         method="BCa", rng=np.random.default_rng(seed),
     ).confidence_interval  # fmt: skip

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+import scipy  # its stats load when they are first asked for
 
 from ..datasets.state import Array
 from .association import ScoreError
@@ -146,7 +146,7 @@ def signed_rank_p(d: Array) -> float:
     d = d[d != 0]
     if len(d) == 0:
         return 1.0
-    result: Any = stats.wilcoxon(d)
+    result: Any = scipy.stats.wilcoxon(d)
     return float(result.pvalue)
 
 
@@ -154,7 +154,7 @@ def t_p(x: Array) -> float | None:
     """Return the two-sided p of the t test that the mean of x (n,) is 0; None where all x are one value but 0."""
     if np.ptp(x) <= 1e-12 * np.abs(x).max():
         return None if x.any() else 1.0
-    result: Any = stats.ttest_1samp(x, 0.0)
+    result: Any = scipy.stats.ttest_1samp(x, 0.0)
     return float(result.pvalue)
 
 
@@ -164,7 +164,7 @@ def rank_biserial(d: Array) -> float:
     W₊ and W₋ are the sums of the ranks of |d| over the positive and the negative ones; 0 where all are 0.
     """
     d = d[d != 0]
-    ranks = stats.rankdata(np.abs(d))
+    ranks = scipy.stats.rankdata(np.abs(d))
     return float((np.sign(d) * ranks).sum() / ranks.sum()) if len(d) else 0.0
 
 
@@ -220,9 +220,9 @@ def bootstrap_interval(
     if method == "BCa" and np.ptp(without) <= 1e-12 * scale:  # every resample says the same
         return value, value
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
+        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
         for name in (method, "percentile"):  # where BCa has no answer
-            interval = stats.bootstrap(
+            interval = scipy.stats.bootstrap(
                 data, statistic, paired=True, vectorized=True, batch=2000, method=name,
                 rng=np.random.default_rng(seed), **options,
             ).confidence_interval  # fmt: skip

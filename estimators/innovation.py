@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ..datasets.epochs import SENSOR
 from ..datasets.state import DIM, Array, Belief
@@ -31,6 +30,8 @@ def gate_widths(gate: Mapping[str, float]) -> Array:
     Args:
         gate: probability by sensor; what is not named always passes.
     """
+    from scipy.stats import chi2  # a third of what importing the estimators would take, and only gates need it
+
     widths = np.full((len(SENSOR), 4), np.inf)
     for kind, sensor in enumerate(SENSOR):
         if sensor in gate:

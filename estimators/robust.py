@@ -17,7 +17,6 @@ from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2
 
 from ..datasets.state import Array
 from .interface import FACTORS, sensors_among
@@ -39,6 +38,8 @@ Losses = Annotated[dict[str, Loss], sensors_among(FACTORS)]
 @cache
 def width(loss: Loss, n: int) -> float:
     """Return the width of a loss for n rows, in sigmas."""
+    from scipy.stats import chi2  # slow to import, and only losses need it
+
     return float(np.sqrt(chi2.isf(chi2.sf(WIDTHS[loss] ** 2, 1), n)))
 
 
