@@ -1,0 +1,171 @@
+"""How a step's time depends on the lag, and on how far into the log it is: the latter ought to be flat."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ...datasets.log import Log
+from ...datasets.state import Array, TimeArray
+from ...estimators.interface import Estimator
+from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
+from .driver import Driver, quickest
+from .profile import Tell
+
+LAGS_S = (1.0, 3.0, 10.0, 30.0)
+PIECES = 24
+"""A log is cut into so many pieces of equal length."""
+BOOTSTRAPS = 2000
+TEN_MINUTES_S = 600.0
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The steps of one estimator on one log: of each the quickest of the repeats, for its work is always the same.
+
+    Attributes:
+        t_s: (epochs,) from the start of the log.
+        step_ns: (epochs,).
+    """
+
+    t_s: Array
+    step_ns: TimeArray
+
+    def ms_per_s(self, begin_s: float, end_s: float) -> float:
+        """Return the computing of the steps in (begin_s, end_s], ms per second of voyage."""
+        inside = (self.t_s > begin_s) & (self.t_s <= end_s)
+        return float(self.step_ns[inside].sum()) * 1e-6 / (end_s - begin_s)
+
+
+def step_times(driver: Driver, log: Log, estimator: Estimator, repeats: int = 3) -> Steps:
+    """Return the step times of an estimator that is warm."""
+    timed = quickest([driver.run(log, estimator) for _ in range(repeats)])
+    return Steps(1e-9 * timed.t_ns.astype(np.float64), timed.step_ns)
+
+
+def by_lag(
+    estimators: Mapping[str, Estimator],
+    log: Log,
+    lags_s: Sequence[float] = LAGS_S,
+    repeats: int = 3,
+    tell: Tell = lambda doing: None,
+) -> dict[str, dict[float | None, float]]:
+    """Return the computing of each estimator's steps, ms per second of voyage, by its lag (None: it has none).
+
+    Taken from when the longest window is full.
+    """
+    found: dict[str, dict[float | None, float]] = {}
+    full_s, end_s = max(lags_s), log.duration_s
+    with Driver(probed=False) as driver:
+        for label, estimator in estimators.items():
+            driver.warm_up(estimator)
+            lagged: Any = estimator
+            variants: dict[float | None, Estimator] = {None: estimator}
+            if hasattr(estimator, "lag_s"):
+                variants = {lag_s: dataclasses.replace(lagged, lag_s=lag_s) for lag_s in lags_s}
+            found[label] = {}
+            for lag_s, variant in variants.items():
+                tell(f"{label}: lag {lag_s or 0:g} s")
+                found[label][lag_s] = step_times(driver, log, variant, repeats).ms_per_s(full_s, end_s)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """How the computing goes as the log goes on.
+
+    Attributes:
+        t_s: (pieces,) middle of each piece of the log.
+        ms_per_s: (pieces,) computing of its steps, ms per second of voyage.
+        growth: what ten minutes more add, as a share of the mean, with its 95 % bootstrap interval over the pieces.
+    """
+
+    t_s: Array
+    ms_per_s: Array
+    growth: tuple[float, float, float]
+
+
+def course(steps: Steps, from_s: float, pieces: int = PIECES) -> Course:
+    """Return the course of the steps after from_s, when the window is full."""
+    edges = np.linspace(from_s, float(steps.t_s[-1]), pieces + 1)
+    cost = np.array([steps.ms_per_s(a, b) for a, b in pairwise(edges)])
+    t_s = 0.5 * (edges[:-1] + edges[1:])
+    draws = np.random.default_rng(0).integers(0, pieces, (BOOTSTRAPS, pieces))
+    drawn = np.array([_growth(t_s[k], cost[k]) for k in draws])
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return Course(t_s, cost, (_growth(t_s, cost), float(low), float(high)))
+
+
+def _growth(t_s: Array, cost: Array) -> float:
+    """Slope by least squares, per ten minutes and relative to the mean."""
+    t = t_s - t_s.mean()
+    return float(t @ cost / (t @ t) * TEN_MINUTES_S / cost.mean()) if t.any() else 0.0
+
+
+def over_log(
+    estimators: Mapping[str, Estimator], log: Log, repeats: int = 3, tell: Tell = lambda doing: None
+) -> dict[str, Course]:
+    """Return the course of each estimator's computing over a log, from when its window is full."""
+    found = {}
+    with Driver(probed=False) as driver:
+        for label, estimator in estimators.items():
+            tell(f"{label}: {log.duration_s / 60:.0f} minutes")
+            driver.warm_up(estimator)
+            steps = step_times(driver, log, estimator, repeats)
+            found[label] = course(steps, min(float(getattr(estimator, "lag_s", 0.0)), 0.5 * log.duration_s))
+    return found
+
+
+def draw_by_lag(found: Mapping[str, Mapping[float | None, float]], looks: Mapping[str, Look], title: str) -> Figure:
+    """Draw the computing against the lag; what has none is a horizontal line."""
+    figure, (axes,) = empty_figure(1, 1, WIDTH_IN, 4.0)
+    for label, by in found.items():
+        look = looks[label]
+        if None in by:
+            axes.axhline(by[None], color=look.colour, linestyle=look.dash, linewidth=1.0)
+        else:
+            axes.plot(
+                [lag_s or 0.0 for lag_s in by],
+                list(by.values()),
+                color=look.colour,
+                marker=look.marker,
+                linestyle="-",
+                linewidth=1.0,
+            )
+    logarithmic(axes, "xy")
+    axes.set(xlabel="lag, s", ylabel="steps, ms per second of voyage")
+    axes.set_title(title, fontsize=9)
+    handles = [
+        handle(label, "" if None in by else looks[label].marker, looks[label].colour, True, "-")
+        for label, by in found.items()
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    return figure
+
+
+def draw_over_log(courses: Mapping[str, Course], looks: Mapping[str, Look], title: str) -> Figure:
+    """Draw the computing against how far into the log it is; the legend tells the growth in ten minutes."""
+    figure, (axes,) = empty_figure(1, 1, WIDTH_IN, 4.2)
+    handles = []
+    for label, one in courses.items():
+        look = looks[label]
+        axes.plot(one.t_s / 60, one.ms_per_s, color=look.colour, linestyle=look.dash, linewidth=1.0)
+        axes.plot(one.t_s / 60, one.ms_per_s, color=look.colour, marker=look.marker, markersize=3, linestyle="none")
+        handles.append(handle(f"{label}: {growth_text(one)}", look.marker, look.colour, True, "-"))
+    logarithmic(axes, "y")
+    axes.set(xlabel="time in the log, minutes", ylabel="steps, ms per second of voyage")
+    axes.set_title(title, fontsize=9)
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, frameon=False, fontsize=8)
+    return figure
+
+
+def growth_text(one: Course) -> str:
+    """Return the growth in ten minutes with its interval, as text."""
+    value, low, high = (100 * share for share in one.growth)
+    return f"{value:+.1f} % [{low:+.1f}, {high:+.1f}] in ten minutes"
