@@ -15,6 +15,7 @@ import pandas as pd
 
 from ..datasets.opening import RecordingNotFound
 from .cluster import run_on_cluster
+from .cold_start import compile_first
 from .experiment import Experiment, ExperimentError, Run
 from .ledger import content_sha256, sole_writer
 from .store import Row, Store, provenance
@@ -64,6 +65,8 @@ def run_experiment(
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
         missing, renewed = _missing(tasks, store, force)
+        if dask in (None, "local"):
+            compile_first(task.run.estimator.create() for task in missing)
         with (
             _progress(len(missing), len(tasks) - len(missing)) as (advance, say),
             closing(run_all(missing, jobs) if dask is None else run_on_cluster(missing, dask, jobs, say)) as finished,
