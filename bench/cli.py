@@ -336,13 +336,33 @@ def timing(
         bool, typer.Option("--counters", help="Count work that no machine changes: factors, callbacks, allocations.")
     ] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 where a budget is missed.")] = False,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Also write the figures to this JSON file.")] = None,
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ESTIMATOR", help='Where its time goes, by lag, and over a log; may be repeated, or "all".'
+        ),
+    ] = None,
+    cost: Annotated[bool, typer.Option("--cost", help="Make the README's table of costs, and its figure.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="Also write to this JSON file; with --profile or --cost, the folder to write to."
+        ),
+    ] = None,
 ) -> None:
     """Measure every budget; with --against, tell whether anything has become slower than in another revision."""
     with refusing_bad_input():
         from .timing import command
 
-        if against is not None:
+        if profile or cost:
+            from .timing import profile_command
+
+            try:
+                good = profile_command.print_cost(out) if cost else profile_command.print_profile(profile or [], out)
+            except KeyboardInterrupt:
+                _say("interrupted: finished runs of --cost are kept, and the same command does the rest")
+                raise typer.Exit(INTERRUPTED) from None
+        elif against is not None:
             good = command.print_comparison(against, only, short, limit, rounds, pairs, out)
         elif counters:
             good = command.print_counters(only, out)

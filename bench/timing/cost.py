@@ -171,7 +171,6 @@ def _pooled_with_interval(runs: Sequence[Record]) -> tuple[float, float, float]:
 
 def write_cost(rows: pd.DataFrame, folder: Path) -> list[Path]:
     """Write cost.md, cost.csv and the figure accuracy-cost into the folder; return the files."""
-    folder.mkdir(parents=True, exist_ok=True)
     page, table = folder / "cost.md", folder / "cost.csv"
     page.write_text(cost_markdown(rows), encoding="utf-8")
     pd.DataFrame(cost_records(rows)).to_csv(table, index=False)

@@ -13,7 +13,7 @@ from ...datasets.scenario import Scenario
 from ...datasets.simulator import simulate
 from ...estimators.registry import ESTIMATORS, create, package_of
 from ..drawing import looks_of, save
-from ..experiment import Experiment
+from ..experiment import Experiment, ExperimentError
 from ..runner import run_experiment
 from ..store import provenance
 from .cost import EXPERIMENT, cost_markdown, write_cost
@@ -28,17 +28,21 @@ LONGEST_S = {"isam2": 300.0, "batch": 300.0, "fls-batch": 300.0}
 """Of those that would take too long, or grow."""
 
 
-def print_profile(names: Sequence[str], folder: Path | None) -> None:
+def print_profile(names: Sequence[str], folder: Path | None) -> bool:
     """Print where the time of these estimators goes, by lag and over a log as well, and draw it.
 
     Args:
         names: of estimators; "all" for every one of ours.
         folder: where profile.csv and the figures go; results/profile without.
 
+    Returns:
+        True.
+
     Raises:
         EstimatorError: an estimator is not known, or does not come to the end.
+        ExperimentError: the folder cannot be made.
     """
-    folder = folder or Path("results") / "profile"
+    folder = _made(folder or Path("results") / "profile")
     chosen = list(ESTIMATORS) if EVERY in names else list(dict.fromkeys(names))
     estimators = {name: create(name) for name in chosen}
     looks = looks_of(list(ESTIMATORS | estimators))
@@ -52,7 +56,6 @@ def print_profile(names: Sequence[str], folder: Path | None) -> None:
             some = {name: one for name, one in estimators.items() if LONGEST_S.get(name, LONG_S) == duration_s}
             courses |= over_log(some, _survey(duration_s), tell=status.update)
     files = [folder / "profile.csv"]
-    folder.mkdir(parents=True, exist_ok=True)
     pd.DataFrame([one.record() for one in profiles]).to_csv(files[0], index=False)
     title = f"{log.name}, {log.duration_s:.0f} s"
     files += save(draw_profile(profiles, f"{title}: where the time goes"), folder / "profile")
@@ -74,6 +77,15 @@ def print_profile(names: Sequence[str], folder: Path | None) -> None:
     for label, one in courses.items():
         out.print(f"{label}, over {one.t_s[-1] / 60:.0f} minutes: {growth_text(one)}")
     console.print(f"{folder}: {', '.join(file.name for file in files)}", highlight=False)
+    return True
+
+
+def _made(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExperimentError(f"{folder}: cannot be made ({error.strerror}); give another --out") from None
+    return folder
 
 
 def _survey(duration_s: float) -> Log:
@@ -91,8 +103,8 @@ def print_cost(folder: Path | None, out: Path = Path("results")) -> bool:
         Whether every run came to its end.
     """
     plan = Experiment.load(EXPERIMENT)
+    folder = _made(folder or out / plan.name)
     rows = run_experiment(plan, out=out, jobs=1)
-    folder = folder or out / plan.name
     files = write_cost(rows, folder)
     print(cost_markdown(rows), end="")
     Console(stderr=True).print(f"{folder}: {', '.join(file.name for file in files)}", highlight=False)
