@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -135,6 +135,7 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
     except OSError as error:
         raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
     _say(f"{folder}: runs.sqlite, table.csv, table.tex, consistency.csv, paired.csv, {len(figures)} figures")
+    _write_report(every, plan, folder, differences)
     shown = set(zip(rows["log"], rows["label"], strict=True))
     print_table(rows, differences=[row for row in differences if (row["log"], row["label"]) in shown])
     standing, renewed = rows.attrs["standing"], rows.attrs["renewed"]
@@ -146,6 +147,41 @@ def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
         _say(f"{len(old)} rows of another spec or version are left out of the files; without --only they are renewed")
     for log, cause in rows.attrs["kept"].items():
         _say(f"{log}: {cause}; its rows are from an earlier run")
+
+
+def _write_report(rows: pd.DataFrame, plan: Experiment, folder: Path, differences: list[dict[str, Any]]) -> None:
+    """Write report.html, or say how to get it; what was asked goes beside it."""
+    from rich.console import Console
+
+    from .report.page import NoExtraError, write_report
+    from .report.results import keep_plan
+
+    keep_plan(plan, folder)
+    try:
+        with Console(stderr=True).status("writing report.html"):
+            file = write_report(rows, folder, differences)
+    except NoExtraError as missing:
+        _say(f"no report.html: {missing}")
+    else:
+        _say(f"{file}: tables, figures and every run, for a browser")
+
+
+@app.command()
+def report(
+    result: Annotated[str, typer.Argument(help="A result folder, or the name of an experiment under `results`.")],
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="The page; RESULT/report.html without.")] = None,
+) -> None:
+    """Write RESULT as one HTML page that needs no network: sortable tables, figures to zoom, every run's spec."""
+    with refusing_bad_input():
+        from rich.console import Console
+
+        from .report.page import report as write
+        from .report.results import find_result
+
+        folder = find_result(result)
+        with Console(stderr=True).status(f"reading {folder}"):
+            file = write(folder, out)
+        typer.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
 
 
 @app.command("list")
