@@ -25,7 +25,8 @@ from ...estimators import create
 from ..experiment import Experiment
 from ..metrics import ate
 from ..run import run_log, score_ticks, scores, warm_up
-from ..runner import Task, run_all
+from ..workers import run_all
+from ..working import Task
 from . import evo
 
 LAGS_S = (3.0, 10.0, 30.0)
@@ -191,19 +192,17 @@ def two_workers_against_one() -> Measured:
     }
     experiment = Experiment.from_dict(plan)
 
-    def rate(jobs: int, folder: Path) -> float:
-        (folder / "trajectories").mkdir(parents=True)
-        tasks, started = [Task(experiment, run, folder) for run in experiment.runs()], 0.0
+    def rate(jobs: int) -> float:
+        tasks, started = [Task.of(experiment, run) for run in experiment.runs()], 0.0
         for done, _ in enumerate(run_all(tasks, jobs), 1):
             if done == WARM_RUNS:
                 started = time.perf_counter()
         return RUNS / (time.perf_counter() - started)
 
     ratios = []
-    with TemporaryDirectory() as temporary:
-        for k in range(2):
-            one, two = (rate(jobs, Path(temporary) / f"{jobs} {k}") for jobs in (1, 2))
-            ratios.append(two / one)
+    for _ in range(2):
+        one, two = rate(1), rate(2)
+        ratios.append(two / one)
     load = os.getloadavg()[0]
     return Measured(tuple(ratios), f"{os.cpu_count()} cores; load at the end, our own part included: {load:.1f}")
 

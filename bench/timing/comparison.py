@@ -7,7 +7,8 @@ things lie in memory), which no taking turns removes: so there are several pairs
 bootstrap over pairs and, within them, over turns.
 
 The intervals hold for all benchmarks together (Bonferroni). What comes out slower than the limit is measured again,
-by twice as many new pairs of twice as many turns, and only that decides: slower is what has its whole second interval above the limit.
+by twice as many new pairs of twice as many turns, and only that decides: slower is what has its whole second interval
+above the limit.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..runner import THREAD_COUNTS
+from ..workers import THREAD_COUNTS
 from . import benchmarks
 from .benchmarks import Benchmark
 from .revision import PREFIX, TimingError, Tree, checked_out, share_compiled, working_tree
