@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 from fathom.bench.cli import app
 from fathom.bench.experiment import Experiment
-from fathom.bench.runner import Bench, Task
 from fathom.bench.store import COLUMNS
 from fathom.bench.timing.cost import BEGIN, END, LAGS_S, cost_markdown, cost_records, draw_accuracy_cost, write_cost
 from fathom.bench.timing.cost import COLUMNS as HEADINGS
+from fathom.bench.working import Bench, Task
 from fathom.estimators import ESTIMATORS
 from typer.testing import CliRunner
 
@@ -21,7 +21,7 @@ README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.fixture(scope="module")
-def rows(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+def rows() -> pd.DataFrame:
     """A filter, a smoother at two lags and one over the whole log, on two seeds of one short dive."""
     plan = Experiment.from_dict(
         {
@@ -36,8 +36,8 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
             "seeds": [1, 2],
         }
     )
-    bench, folder = Bench(), tmp_path_factory.mktemp("cost")
-    found = [row for run in plan.runs() for row in bench.execute(Task(plan, run, folder))]
+    bench = Bench()
+    found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).rows]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS))
 
 
