@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -187,15 +190,15 @@ def test_a_worker_that_is_killed_costs_a_retry_and_the_rows_are_those_of_a_local
 def test_a_run_that_takes_its_workers_along_is_a_failed_row_and_the_rest_is_done(
     client: Client, scheduler: str, tmp_path: Path
 ) -> None:
-    plan = experiment(estimators=poisoned("kills", "dies", "none"), seeds=2)
+    plan = experiment(estimators=poisoned("kills", "dies", "none"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cluster, "TRIES", 2)
         rows = run_experiment(plan, out=tmp_path, dask=scheduler)
-    assert rows["label"].tolist() == ["kills", "dies", "none"] * 2
-    assert rows["status"].tolist() == ["failed", "failed", "done"] * 2
+    assert rows["label"].tolist() == ["kills", "dies", "none"]
+    assert rows["status"].tolist() == ["failed", "failed", "done"]
     kills, dies, none = (rows[rows["label"] == label] for label in ("kills", "dies", "none"))
     assert all(cause.startswith("its worker was lost 2 times (tcp://") for cause in kills["cause"])
-    assert dies["cause"].tolist() == ["worker died (exit code 3)"] * 2
+    assert dies["cause"].tolist() == ["worker died (exit code 3)"]
     assert json.loads(kills["machine"].iloc[0]) == json.loads(none["machine"].iloc[0])
     assert_nothing_is_left(client)
 
@@ -340,3 +343,34 @@ def test_recordings_are_sought_where_the_worker_has_them(tmp_path: Path, monkeyp
     assert remote._with_data_here(task).data is None
     (tmp_path / "not here").mkdir()
     assert remote._with_data_here(task) is task
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "cluster.md"
+
+
+def test_the_page_says_what_the_commands_have() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    known = {
+        "fathom run": CliRunner().invoke(app, ["run", "--help"], env={"COLUMNS": "200"}).output,
+        "dask scheduler": help_of("dask_scheduler"),
+        "dask worker": help_of("dask_worker"),
+    }
+    shown = [line for block in re.findall(r"```\n(.*?)```", page, re.DOTALL) for line in block.splitlines()]
+    told = 0
+    for line in shown:
+        (command,) = (command for command in known if command in line)
+        for option in re.findall(r"--[a-z-]+", line):
+            assert option in known[command], line
+            told += 1
+    assert told >= 7
+    for script in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        calls = [node for node in ast.walk(ast.parse(script)) if isinstance(node, ast.Call)]
+        (call,) = (call for call in calls if ast.unparse(call.func) == "run_experiment")
+        given = {keyword.arg for keyword in call.keywords}
+        assert given <= set(inspect.signature(run_experiment).parameters)
+        assert Experiment.load(ast.literal_eval(call.args[0])).runs()
+
+
+def help_of(command: str) -> str:
+    asked = [sys.executable, "-m", f"distributed.cli.{command}", "--help"]
+    return subprocess.run(asked, capture_output=True, text=True, check=True, timeout=300).stdout
