@@ -37,13 +37,13 @@ class Column(NamedTuple):
 
 
 COLUMNS = (
-    Column("ate_rmse_m", ("ATE", "m")),
-    Column("heading_rmse_deg", ("heading", "°")),
-    Column("drift_end_percent", ("drift", "%")),
-    Column("rpe_rmse_m", ("RPE", "m")),
+    Column("ate_rmse_m", ("ATE", "(m)")),
+    Column("heading_rmse_deg", ("heading", "(°)")),
+    Column("drift_end_percent", ("drift", "(%)")),
+    Column("rpe_rmse_m", ("RPE", "(m)")),
     Column("nees_position", ("NEES", "per dof"), best=None, divisor=3.0),
-    Column("step_median_us", ("step, median", "µs")),
-    Column("step_p99_us", ("step, p99", "µs")),
+    Column("step_median_us", ("step, median", "(µs)")),
+    Column("step_p99_us", ("step, p99", "(µs)")),
     Column("real_time_factor", ("real-time", "factor"), best=max),
 )
 COSTS = ("step_median_us", "step_p99_us", "real_time_factor")
@@ -74,6 +74,7 @@ def _table(summary: Sequence[Record], rows: Sequence[Record], label: str) -> str
         r"\centering",
         rf"\caption{{{_caption_of(summary, rows)}}}",
         rf"\label{{{label}}}",
+        r"\smallskip",
         r"\footnotesize",
         r"\setlength{\tabcolsep}{3.5pt}",
         rf"\begin{{tabular}}{{@{{}}{'p{42mm}' if long else 'l'}rl{'r' * len(COLUMNS)}@{{}}}}",
@@ -132,8 +133,7 @@ def _cell(row: Record, column: Column, bold: bool) -> str:
     value = row[column.score]
     if value is None:
         return ABSENT
-    ends = [row.get(f"{column.score}{end}") for end in ("_low", "_high")]
-    low, high = (None, None) if None in ends else (end / column.divisor for end in ends)
+    low, high = (row.get(f"{column.score}{end}") for end in ("_low", "_high"))
     return f"${number(value / column.divisor, low, high, bold)}$"
 
 

@@ -50,7 +50,7 @@ def draw_step_times(rows: Sequence[Record], looks: dict[str, Look], title: str) 
     left_out = f" (runs on {len(others)} other machine{'s' if len(others) > 1 else ''} left out)" if others else ""
     over = f"{runs} runs each" if runs > 1 else "one run each"
     title_above(
-        figure, f"{title}: step times, {over}; markers: median, p99, longest\n{machine_name(machine)}{left_out}"
+        figure, f"{title}: step times, {over}\nmarkers: median, p99, longest\n{machine_name(machine)}{left_out}"
     )
     legend_below(figure, [look_handle(label, looks[label]) for label in every], most=3)
     return figure
