@@ -214,7 +214,7 @@ def _logs() -> dict[str, str]:
 def _experiments() -> dict[str, str]:
     import yaml
 
-    from .experiment import shipped_experiments
+    from .shipped import shipped_experiments
 
     return {name: yaml.safe_load(path.read_text())["description"] for name, path in shipped_experiments().items()}
 

@@ -19,7 +19,7 @@ from rich.console import Console
 from .. import estimators
 from ..estimators.imu import integrate
 from ..estimators.interface import Estimator
-from ..estimators.registry import ESTIMATORS, EstimatorError
+from ..estimators.registry import EstimatorError
 from .experiment import plain
 
 NOTICE = "compiling the estimators, once on this machine; this takes minutes"
@@ -28,12 +28,12 @@ NOTICE = "compiling the estimators, once on this machine; this takes minutes"
 def compile_first(wanted: Iterable[Estimator]) -> None:
     """Compile what the estimators need and no earlier run has compiled, in one process; nothing to do as a rule.
 
-    Every worker would compile it all by itself, a minute's computing and some 800 MB each. Where anything is compiled
+    Every worker would compile it all by itself, a minute's computing or two and hundreds of megabytes each. Where anything is compiled
     there is a line on stderr, and on a terminal what is being done. Estimators of other packages are left to their
     workers; so is whatever goes wrong here.
     """
-    own = tuple(ESTIMATORS.values())
-    unknown = {code_of(one): one for one in wanted if isinstance(one, own)}
+    own = f"{estimators.__name__}."
+    unknown = {code_of(one): one for one in wanted if type(one).__module__.startswith(own)}
     with suppress(OSError):
         for code in warm():
             unknown.pop(code, None)
@@ -84,4 +84,4 @@ def _stamp() -> Path:
     folder = Path(estimators.__file__).parent
     sources = [f"{path.name} {path.stat().st_mtime_ns} {path.stat().st_size}" for path in sorted(folder.glob("*.py"))]
     state = [*sources, sys.version, numba.__version__, llvm.get_host_cpu_name()]
-    return Path(integrate.stats.cache_path) / f"warm-{sha256(repr(state).encode()).hexdigest()[:12]}.txt"
+    return Path(str(integrate.stats.cache_path)) / f"warm-{sha256(repr(state).encode()).hexdigest()[:12]}.txt"

@@ -25,11 +25,10 @@ from ..estimators.registry import create
 from .metrics import Alignment, Dims
 from .paired import OVER_SEEDS, Comparison
 from .run import Scoring
+from .shipped import shipped_experiments
 from .variants import Grid, changed, points
 
 STRICT = ConfigDict(extra="forbid", populate_by_name=True)
-SHIPPED = Path(__file__).parent / "experiments"
-
 
 MOST_SEEDS = 100_000
 """A larger number of seeds is a seed that lacks its brackets."""
@@ -381,11 +380,6 @@ class Experiment:
             "max_gap_s": self.max_gap_s,
             "timeout_s": self.timeout_s,
         }
-
-
-def shipped_experiments() -> dict[str, Path]:
-    """Return the experiments that come with Fathom, by name."""
-    return {path.stem: path for path in sorted(SHIPPED.glob("*.yaml"))}
 
 
 def find_experiment(name_or_path: str | Path) -> Path:

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fathom.bench.experiment import Experiment, ExperimentError, shipped_experiments
+from fathom.bench.experiment import Experiment, ExperimentError
 from fathom.bench.run import warm_up
 from fathom.bench.runner import run_experiment
+from fathom.bench.shipped import shipped_experiments
 from fathom.bench.store import load_runs
 from fathom.bench.summary import summarise
 from fathom.bench.table import failures

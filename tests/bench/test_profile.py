@@ -172,6 +172,7 @@ def test_the_table_of_the_fleet_fits_a_page_and_every_estimator_has_a_bar(profil
     ("what", "absent"),
     [
         ("fathom.bench.cli", {"numba", "gtsam", "scipy", "pandas", "matplotlib", "pydantic", "numpy", "rich.table"}),
+        ("fathom.bench.shipped", {"numba", "gtsam", "scipy", "pandas", "matplotlib", "pydantic", "numpy", "yaml"}),
         ("fathom.datasets", {"numba", "gtsam", "scipy.stats", "scipy.optimize", "pandas", "matplotlib", "pydantic"}),
         ("fathom.estimators", {"scipy.stats", "filterpy", "pandas", "pyarrow", "matplotlib"}),
         ("fathom.bench.runner", {"scipy.stats", "filterpy", "matplotlib"}),
