@@ -28,9 +28,9 @@ NOTICE = "compiling the estimators, once on this machine; this takes minutes"
 def compile_first(wanted: Iterable[Estimator]) -> None:
     """Compile what the estimators need and no earlier run has compiled, in one process; nothing to do as a rule.
 
-    Every worker would compile it all by itself, a minute's computing or two and hundreds of megabytes each. Where anything is compiled
-    there is a line on stderr, and on a terminal what is being done. Estimators of other packages are left to their
-    workers; so is whatever goes wrong here.
+    Every worker would compile it all by itself, a minute's computing or two and hundreds of megabytes each. Where
+    anything is compiled there is a line on stderr, and on a terminal what is being done. Estimators of other packages
+    are left to their workers; so is whatever goes wrong here.
     """
     own = f"{estimators.__name__}."
     unknown = {code_of(one): one for one in wanted if type(one).__module__.startswith(own)}
