@@ -1,17 +1,20 @@
-# Two commands set everything up: `make bench` and `make test`. FATHOM_DATA names the folder of recordings.
+# Two commands set everything up: `make bench` and `make test`; `make timing` measures every budget. FATHOM_DATA names the folder of recordings.
 
 PYTHON ?= python3
 DATA := $(firstword $(FATHOM_DATA) $(wildcard ../shared/data))
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: bench test lint clean
+.PHONY: bench test timing lint clean
 
 bench: .venv/core
 	$(BIN)/fathom run filter_vs_smoother $(if $(DATA),--data $(DATA))
 
 test: .venv/dev lint
 	$(BIN)/python -m pytest -q
+
+timing: .venv/dev
+	$(BIN)/fathom timing
 
 # basedpyright cannot follow an editable install, so it sees a plain one
 lint: .venv/dev

@@ -386,24 +386,29 @@ def timing(
         ),
     ] = None,
 ) -> None:
-    """Measure every budget; with --against, tell whether anything has become slower than in another revision."""
+    """Measure every budget of speed and memory, or compare with another revision.
+
+    With --against, exit status 1 says that something is slower: its whole interval is above --limit. The working tree
+    counts as it is. Without, a missed budget is said and no error, but for --strict. See docs/timing.md.
+    """
     with refusing_bad_input():
-        from .timing import command
+        from .timing.command import print_budgets, print_comparison, print_counters
+        from .timing.profile_command import print_cost, print_profile
 
-        if profile or cost:
-            from .timing import profile_command
-
-            try:
-                good = profile_command.print_cost(out) if cost else profile_command.print_profile(profile or [], out)
-            except KeyboardInterrupt:
-                _say("interrupted: finished runs of --cost are kept, and the same command does the rest")
-                raise typer.Exit(INTERRUPTED) from None
-        elif against is not None:
-            good = command.print_comparison(against, only, short, limit, rounds, pairs, out)
-        elif counters:
-            good = command.print_counters(only, out)
-        else:
-            good = command.print_budgets(only, out) or not strict
+        try:
+            if cost:
+                good = print_cost(out)
+            elif profile:
+                good = print_profile(profile, out)
+            elif against is not None:
+                good = print_comparison(against, only, short, limit, rounds, pairs, out)
+            elif counters:
+                good = print_counters(only, out)
+            else:
+                good = print_budgets(only, out) or not strict
+        except KeyboardInterrupt:
+            _say("interrupted" + ("; finished runs are kept, and the same command does the rest" if cost else ""))
+            raise typer.Exit(INTERRUPTED) from None
     if not good:
         raise typer.Exit(SOME_FAILED)
 

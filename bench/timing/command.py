@@ -81,7 +81,10 @@ def print_comparison(
 
 
 def print_budgets(only: str | None, out: Path | None) -> bool:
-    """Measure every budget of DESIGN, section 8, print and save what came out, and return whether all hold."""
+    """Measure every budget of DESIGN, section 8, print and save what came out, and return whether all hold.
+
+    Interrupted, it prints and saves what it has, and raises KeyboardInterrupt.
+    """
     from .budgets import BUDGETS, Measured
 
     chosen = select(BUDGETS, only)
@@ -93,6 +96,8 @@ def print_budgets(only: str | None, out: Path | None) -> bool:
                 found.append((budget.measure(), ""))
             except ModuleNotFoundError as error:
                 found.append((None, f"{error.name} is not installed: pip install 'fathom-bench[dev]'"))
+            except KeyboardInterrupt:
+                break
     table = Table(
         *("what over what", "budget", "measured", "from – to", "verdict", "note"),
         box=box.SIMPLE_HEAD,
@@ -102,7 +107,7 @@ def print_budgets(only: str | None, out: Path | None) -> bool:
     for column in table.columns[1:4]:
         column.justify = "right"
     rows = []
-    for budget, (measured, missing) in zip(chosen, found, strict=True):
+    for budget, (measured, missing) in zip(chosen, found, strict=False):
         limit = f"{'≥' if budget.least else '≤'} {budget.limit:g}"
         if measured is None:
             verdict, numbers, note = "not measured", ("–", "–"), missing
@@ -115,6 +120,8 @@ def print_budgets(only: str | None, out: Path | None) -> bool:
         rows[-1]["ratios"] = [] if measured is None else list(measured.ratios)
     console().print(table)
     save(out, {"budgets": rows})
+    if len(found) < len(chosen):
+        raise KeyboardInterrupt
     return all(row["verdict"] == "holds" for row in rows)
 
 

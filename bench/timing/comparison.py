@@ -13,12 +13,8 @@ above the limit.
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,10 +23,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..workers import THREAD_COUNTS
 from . import benchmarks
 from .benchmarks import Benchmark
-from .revision import PREFIX, TimingError, Tree, checked_out, share_compiled, working_tree
+from .processes import Side, started
+from .revision import PREFIX, TimingError, checked_out, share_compiled, working_tree
 
 Array = NDArray[np.float64]
 Verdict = Literal["slower", "slower?", "same", "faster", "new", "broken"]
@@ -137,89 +133,6 @@ def compare(revision: str, chosen: Sequence[Benchmark], effort: Effort, limit: f
     )
 
 
-@dataclass(frozen=True)
-class Side:
-    """A tree with the folder that leads to its packages; processes of it can be started."""
-
-    tree: Tree
-    packages: Path
-    inputs: Path
-
-    def start(self) -> Worker:
-        """Start a process."""
-        here = Path(__file__).parent
-        command = [str(self.tree.python), "-P", str(here / "worker.py")]
-        command += [str(self.packages), str(here / "benchmarks.py"), str(self.inputs)]
-        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        environment |= dict.fromkeys(THREAD_COUNTS, "1") | {"PYTHONHASHSEED": "0"}
-        return Worker(self.tree.name, command, environment)
-
-
-class Worker:
-    """A process that times benchmarks, see `worker`."""
-
-    def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> None:
-        self._name = name
-        self._process = subprocess.Popen(
-            command,
-            env=dict(environment),
-            text=True,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is ours to handle
-        )
-
-    def send(self, **command: Any) -> None:
-        """Hand over a command; the answer is there to be received."""
-        assert self._process.stdin is not None
-        try:
-            self._process.stdin.write(json.dumps(command) + "\n")
-            self._process.stdin.flush()
-        except OSError:
-            return  # `receive` says so
-
-    def receive(self) -> dict[str, Any]:
-        """Return the answer to the last command.
-
-        Raises:
-            TimingError: the process has died.
-        """
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise TimingError(
-                f"{self._name}: its process died (exit code {self._process.wait()}); its last words are above"
-            )
-        return json.loads(line)
-
-    def ask(self, **command: Any) -> dict[str, Any]:
-        """Send a command and return the answer."""
-        self.send(**command)
-        return self.receive()
-
-    def close(self) -> None:
-        """End the process, whatever it is doing."""
-        self._process.kill()
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            try:
-                pipe.close()
-            except BrokenPipeError:
-                continue
-
-
-@contextmanager
-def _started(*sides: Side) -> Iterator[list[Worker]]:
-    workers: list[Worker] = []
-    try:
-        workers += [side.start() for side in sides]
-        yield workers
-    finally:
-        for worker in workers:
-            worker.close()
-
-
 def _warm_up(
     now: Side, then: Side, chosen: Sequence[Benchmark], progress: Progress
 ) -> tuple[dict[str, int], dict[str, Compared]]:
@@ -230,7 +143,7 @@ def _warm_up(
     answers: list[dict[str, dict[str, Any]]] = []
     for side in (now, then):
         same = side is then and share_compiled(now.tree.root, then.tree.root)
-        with _started(side) as (worker,):
+        with started(side) as (worker,):
             found = {}
             for k, each in enumerate(chosen):
                 what = "loading" if same else "compiling"
@@ -264,7 +177,7 @@ def _measure(
     seconds = {each.name: np.zeros((effort.pairs, effort.rounds, 4)) for each in chosen}
     units: dict[str, tuple[int, int]] = {}
     for pair in range(effort.pairs):
-        with _started(now, then) as workers:
+        with started(now, then) as workers:
             for each in chosen:
                 for worker in workers:
                     worker.send(prepare=each.name)

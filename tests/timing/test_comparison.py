@@ -102,7 +102,7 @@ def test_both_sides_take_turns_and_are_not_confused(monkeypatch: pytest.MonkeyPa
     def started(*_: object) -> Iterator[list[Clockwork]]:
         yield [Clockwork(0.06, calls), Clockwork(0.04, calls)]
 
-    monkeypatch.setattr(comparison, "_started", started)
+    monkeypatch.setattr(comparison, "started", started)
     each = BENCHMARKS[0]
     rows = comparison._measure(None, None, [each], {each.name: 1}, Effort(1, 2), LIMIT, 0.95, lambda *_: None)  # type: ignore[arg-type]
     assert calls == [0.06, 0.04, 0.04, 0.06, 0.04, 0.06, 0.06, 0.04]  # A B B A, then B A A B
