@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import sqlite3
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ import pandas as pd
 from .experiment import ExperimentError
 from .floor_ratio import FLOORS
 from .ledger import FINAL, versions
+from .machine import machine
 from .run import COSTS, INNOVATIONS, SCORES
 
 Row = Mapping[str, Any]
@@ -189,13 +189,7 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
 @cache
 def provenance() -> dict[str, str]:
     """Return commit, versions and machine of this process, as a row holds them."""
-    machine = {
-        "cpu": _cpu_model(),
-        "cores": os.cpu_count(),
-        "platform": platform.platform(),
-        "node": platform.node(),
-    }
-    return {"commit_id": _commit(), "versions": json.dumps(versions()), "machine": json.dumps(machine)}
+    return {"commit_id": _commit(), "versions": json.dumps(versions()), "machine": json.dumps(machine())}
 
 
 def _commit() -> str:
@@ -208,13 +202,3 @@ def _commit() -> str:
         return subprocess.run(describe, capture_output=True, check=True, text=True, timeout=20).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return f"fathom-bench {versions()['fathom-bench']}"
-
-
-def _cpu_model() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next(
-        (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.processor()
-    )
