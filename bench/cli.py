@@ -184,6 +184,41 @@ def report(
         typer.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
 
 
+@app.command()
+def reproduce(
+    result: Annotated[str, typer.Argument(help="A folder that `fathom run` wrote, or its name under `results`.")],
+    row: Annotated[
+        str | None,
+        typer.Argument(
+            help='"log/label" or "log/label/seed", a pattern of these, or how an identity begins; all without.'
+        ),
+    ] = None,
+    data: Data = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Worker processes; 0: one per core.")] = 0,
+) -> None:
+    """Run rows of RESULT again from what it stores, and say whether the scores are identical, bit for bit.
+
+    Exit status 0: all are; 1: some are not, or could not be run again; 2: nothing was run. RESULT stays as it is.
+    """
+    with refusing_bad_input():
+        from .report.results import find_result
+        from .reproduce import reproduce_all
+        from .reproduce_table import print_reproduction
+        from .stored import choose
+
+        runs = choose(find_result(result), row)
+        every, whole = reproduce_all(runs, data, jobs)
+        print_reproduction(every)
+    if not whole:
+        _say(f"interrupted: {len(every)} of {len(runs)} runs were looked at; nothing was written")
+        raise typer.Exit(INTERRUPTED)
+    ran = [again for again in every if again.skipped is None]
+    if not ran:
+        raise typer.Exit(BAD_INPUT)
+    if not all(again.is_identical for again in every if again.stored.first["status"] != "absent"):
+        raise typer.Exit(SOME_FAILED)
+
+
 @app.command("list")
 def list_(what: Listing) -> None:
     """Print the known estimators (with their options), logs, shipped experiments, or scores."""
