@@ -5,7 +5,7 @@ DATA := $(firstword $(FATHOM_DATA) $(wildcard ../shared/data))
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: bench test timing lint clean
+.PHONY: bench test timing reference lint clean
 
 bench: .venv/core
 	$(BIN)/fathom run filter_vs_smoother $(if $(DATA),--data $(DATA))
@@ -15,6 +15,10 @@ test: .venv/dev lint
 
 timing: .venv/dev
 	$(BIN)/fathom timing
+
+# results/reference/*.csv anew; recorded logs among them where FATHOM_DATA has them
+reference: .venv/core
+	$(if $(DATA),FATHOM_DATA=$(DATA)) $(BIN)/python -m fathom.bench.reference
 
 # basedpyright cannot follow an editable install, so it sees a plain one
 lint: .venv/dev

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..runner import THREAD_COUNTS
+from ..workers import THREAD_COUNTS
 from .revision import TimingError, Tree
 
 
