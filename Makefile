@@ -1,4 +1,5 @@
-# Two commands set everything up: `make bench` and `make test`; `make timing` measures every budget. FATHOM_DATA names the folder of recordings.
+# Two commands set everything up: `make bench` and `make test`; `make timing` measures every budget.
+# FATHOM_DATA names the folder of recordings.
 
 PYTHON ?= python3
 DATA := $(firstword $(FATHOM_DATA) $(wildcard ../shared/data))

@@ -349,6 +349,65 @@ def _undescribed(path: Path) -> Recording | None:
     return recording_at(path) if path.is_file() else None
 
 
+class Output(StrEnum):
+    """Which of what an estimator says is scored."""
+
+    online = "online"
+    hindsight = "hindsight"
+
+
+@app.command()
+def tune(
+    experiment: Annotated[str, typer.Argument(help="A shipped experiment's name, or a YAML file.")],
+    estimator: Annotated[
+        str | None, typer.Option(help="Label of the one to tune; needed where several can be.")
+    ] = None,
+    train: Annotated[list[str] | None, typer.Option(help='Pattern of a log, or "log/seed"; may be repeated.')] = None,
+    held_out: Annotated[list[str] | None, typer.Option(help="Likewise: what the search never sees.")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help="Whose noise to search; may be repeated; every sensor, gyro and accel.")
+    ] = None,
+    trials: Annotated[int, typer.Option(min=2, help="How many sets of factors, the data sheet among them.")] = 60,
+    score: Annotated[str, typer.Option(help="What to make smaller, or more honest; as in `fathom list scores`.")] = (
+        "ate_rmse_m"
+    ),
+    output: Annotated[Output, typer.Option(help="Of what was said at once, or with hindsight.")] = Output.online,
+    span: Annotated[float, typer.Option(min=1.01, help="Factors are searched from 1/SPAN to SPAN.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the search.")] = 0,
+    data: Data = None,
+    out: Annotated[Path, typer.Option(help="Where results go.")] = Path("results"),
+    jobs: Annotated[int, typer.Option(min=0, help="Worker processes; 0: one per core.")] = 0,
+    repair: Repair = False,
+) -> None:
+    """Search the factors on an estimator's noise on training logs, and check them once on logs that are held out.
+
+    Without --train, --held-out or `tune:` in the experiment, the first half of a simulated log's seeds trains. The same
+    command goes on where it was stopped.
+    """
+    with refusing_bad_input():
+        from .experiment import Experiment, Sides
+        from .tuning import prepare
+        from .tuning_objective import Objective
+        from .tuning_outcome import judge, print_outcome, run_with_bar, write_outcome
+        from .tuning_search import searching
+
+        plan, sides = Experiment.load(experiment), Sides(tuple(train or ()), tuple(held_out or ()))
+        objective = Objective(score, output.value)
+        tuning = prepare(plan, estimator, sides, sensor or (), objective, (1 / span, span), seed, out, data, repair)
+        try:
+            with searching(tuning) as search:
+                for note in search.notes:
+                    _say(note)
+                run_with_bar(search, trials, jobs)
+                outcome = judge(search)
+        except KeyboardInterrupt:
+            _say(f"interrupted: what is finished is kept in {tuning.folder}; the same command goes on")
+            raise typer.Exit(INTERRUPTED) from None
+        files = write_outcome(outcome)
+        print_outcome(outcome)
+        _say(f"{tuning.folder}: {', '.join(file.name for file in files)}, study.sqlite, runs.sqlite")
+
+
 @app.command()
 def score(
     truth: Annotated[Path, typer.Argument(help="TUM file: t x y z qx qy qz qw.")],

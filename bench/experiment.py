@@ -244,6 +244,20 @@ def _can_be_compared(scores: tuple[str, ...]) -> tuple[str, ...]:
     return scores
 
 
+@dataclass(frozen=True, config=STRICT)
+class Sides:
+    """What `fathom tune` may look at: patterns of a log's name, or of "log/seed".
+
+    Attributes:
+        train: what the search sees; without patterns, all that is not held out.
+        held_out: what it never sees; without patterns, all that does not train. Without either, of simulated logs the
+            first half of the seeds trains and the rest is held out, and recorded logs take no part.
+    """
+
+    train: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+
+
 class Run(NamedTuple):
     """One estimator on one log; seed is None for a recorded log."""
 
@@ -272,6 +286,7 @@ class Experiment:
         baseline: the label with which every estimator is compared that names no other.
         compare: scores in which variants are compared with their baselines; every one more is more tests to correct
             for.
+        tune: which logs and seeds train `fathom tune`, and which are held out.
         max_gap_s: longest gap in the IMU that is bridged.
         timeout_s: longest time for one run.
     """
@@ -290,6 +305,7 @@ class Experiment:
         "heading_rmse_deg",
         "velocity_rmse_m_s",
     )
+    tune: Sides = Sides()
     max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0
 
@@ -443,7 +459,7 @@ def _explain(error: Any) -> str:
 
 def _known_keys(parents: list[Any]) -> list[str]:
     """Return the keys allowed under this place of the file."""
-    kind = {"logs": LogSpec, "estimators": EstimatorSpec, "scores": Scoring}.get(
+    kind = {"logs": LogSpec, "estimators": EstimatorSpec, "scores": Scoring, "tune": Sides}.get(
         parents[0] if parents else "", Experiment
     )
     return ["with" if field.name == "options" else field.name for field in dataclasses.fields(kind)]

@@ -1,0 +1,129 @@
+"""What a search makes smaller: a score as it is, or how far an honest one is from what it ought to be."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from ..datasets.errors import nearest
+from ..datasets.state import Array
+from .experiment import ExperimentError
+from .floor_ratio import FLOORS
+from .paired import FEWEST_SEEDS, OVER_SEEDS, TAKE, bootstrap_interval
+from .run import INNOVATIONS
+from .summary import MEDIAN, POOLED
+
+DUE: dict[str, float] = (
+    dict.fromkeys(INNOVATIONS, 1.0)
+    | {f"nees_{block}": 3.0 for block in ("position", "attitude", "velocity")}
+    | {"nees_biases": 6.0, "nees_all": 15.0}
+    | {f"within_{k}sigma_{of}": float(chi2.cdf(k**2, 1)) for k in (1, 2, 3) for of in ("position", "all")}
+)
+"""What scores of honesty are of an honest belief."""
+
+SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(INNOVATIONS)
+"""What can be searched for: no cost, for noise does not change it, and no floor, for it is nobody's."""
+
+
+BOOTSTRAP = {"confidence_level": 0.95, "n_resamples": 9999}
+
+
+class Marks(NamedTuple):
+    """One score of several runs: values (n,), and weights (n,): how many errors each was taken over."""
+
+    values: Array
+    weights: Array
+
+
+@dataclass(frozen=True)
+class Objective:
+    """A score of one of an estimator's outputs, and the loss that it is made into.
+
+    The loss of a score of honesty is |ln(score / what is due)|, twice too large being as bad as twice too small; of any
+    other it is the score. Over runs it is taken as tables take it: squared errors are pooled before the root.
+
+    Raises:
+        ExperimentError: no such score, or not of this output.
+    """
+
+    score: str
+    output: str = "online"
+
+    def __post_init__(self) -> None:
+        if self.score not in SCORES:
+            known = ", ".join(SCORES)
+            raise ExperimentError(f"--score: no score {self.score!r}{nearest(self.score, SCORES)} (known: {known})")
+        if self.needs_nis and self.output != "online":
+            raise ExperimentError(f"--score {self.score}: innovations are of what was said online")
+
+    @property
+    def needs_nis(self) -> bool:
+        """Whether runs must be judged by their innovations."""
+        return self.score in INNOVATIONS
+
+    @property
+    def is_distance(self) -> bool:
+        """Whether the loss is a distance from what is due, 0 at best."""
+        return self.score in DUE
+
+    def lacking(self, row: Mapping[str, Any]) -> str | None:
+        """Return why a row has not the score; None where it has."""
+        name = row["log"] if row["seed"] is None else f"{row['log']}/{row['seed']}"
+        if row["status"] != "done":
+            return f"{name}: {row['status']}: {row['cause']}"
+        if row["output"] != self.output or row.get(self.score) is None:
+            return f"{name}: no {self.score} of what is said {self.output}"
+        return None
+
+    def marks(self, rows: Sequence[Mapping[str, Any]]) -> Marks:
+        """Return the score of these rows, each of which has it."""
+        weights = np.ones(len(rows))
+        if self.needs_nis:
+            weights = np.array([json.loads(row["nis_dof"])[self.score.removeprefix("nis_")] for row in rows], float)
+        elif self.score in POOLED:
+            weights = np.array([row[POOLED[self.score]] for row in rows], float)
+        return Marks(np.array([row[self.score] for row in rows], float), weights)
+
+    def taken(self, values: Array, weights: Array, axis: int = -1) -> Array:
+        """Return the score over runs."""
+        if self.needs_nis:
+            return (weights * values).sum(axis=axis) / weights.sum(axis=axis)
+        return TAKE[OVER_SEEDS[self.score]](values, weights, axis)
+
+    def loss(self, values: Array, weights: Array, axis: int = -1) -> Array:
+        """Return what is to become smaller."""
+        score = self.taken(values, weights, axis)
+        return np.abs(np.log(score / DUE[self.score])) if self.is_distance else score
+
+    def interval(self, marks: Marks) -> tuple[float, float] | None:
+        """Return the 95 % bootstrap interval over runs of the score; None where they are too few."""
+        if len(marks.values) < FEWEST_SEEDS:
+            return None
+        v, n = marks
+        return bootstrap_interval((v, n, v), lambda v, n, _, axis=-1: self.taken(v, n, axis), "BCa", 0, **BOOTSTRAP)
+
+    def gain(self, tuned: Marks, sheet: Marks) -> tuple[float, tuple[float, float] | None]:
+        """Return by how much the tuned are better, and the 95 % bootstrap interval of that, a run's two together.
+
+        The gain is the loss of the data sheet less that of the tuned, or the logarithm of their ratio where the loss is
+        no distance: 0.1 is a tenth less either way.
+        """
+
+        def less(v: Array, n_v: Array, b: Array, n_b: Array, axis: int = -1) -> Array:
+            of_v, of_b = self.loss(v, n_v, axis), self.loss(b, n_b, axis)
+            return of_b - of_v if self.is_distance else np.log(of_b / of_v)
+
+        data = (*tuned, *sheet)
+        return float(less(*data)), bootstrap_interval(data, less, "BCa", 0, **BOOTSTRAP) if len(
+            tuned.values
+        ) >= FEWEST_SEEDS else None
+
+    def gain_of(self, tuned: float, sheet: float) -> float:
+        """Return the gain between two losses."""
+        return sheet - tuned if self.is_distance else math.log(sheet / tuned)

@@ -1,0 +1,222 @@
+"""Search an estimator's noise factors on training runs, and look once at what was held out.
+
+The search is a tree-structured Parzen estimator (optuna). Trial 0 is the data sheet, every factor 1. Each trial is a set
+of ordinary runs in worker processes; whatever is finished is in the store at once, so the same command goes on where it
+was stopped, and ends as if it had not been.
+
+Source: Bergstra, Bardenet, Bengio & Kégl 2011, Algorithms for Hyper-Parameter Optimization, NeurIPS 24.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from .experiment import ExperimentError, Run
+from .ledger import FINAL, sole_writer
+from .runner import run_all
+from .store import Row, Store
+from .summary import groups, records
+from .tuning import Tuning
+from .tuning_sides import unit
+
+BATCH = 10
+"""Trials asked for before any of them is run. It does not depend on how many workers there are, so trials do not."""
+
+
+class Trial(NamedTuple):
+    """One point of the search; loss is None where a run did not come to its end, or had no score, and why."""
+
+    number: int
+    factors: dict[str, float]
+    loss: float | None
+    cause: str | None = None
+
+
+class Progress(NamedTuple):
+    """How far a search is: trials whose runs have ended, of how many, and the best of them."""
+
+    known: int
+    trials: int
+    best: Trial | None
+
+
+class Search:
+    """One search, its study and its store open; `searching` opens them.
+
+    Attributes:
+        resumed: how many trials an earlier search has left behind, by the same study.
+        others: how many other studies there are: of another spec, log, range, version or seed.
+    """
+
+    def __init__(self, tuning: Tuning, study: Any, others: int, store: Store, scratch: Path) -> None:
+        self.tuning, self.others = tuning, others
+        self._study, self._store, self._scratch = study, store, scratch
+        self._rows: dict[tuple[str, str, int | None], list[Row]] = {}
+        self._keep(records(store.read()))
+        self.resumed = len(self.trials())
+
+    @property
+    def notes(self) -> list[str]:
+        """What the user should know before the search begins, in sentences."""
+        split, found = self.tuning.split, []
+        found.append(
+            f"training on {', '.join(map(unit, split.train))}; held out: {', '.join(map(unit, split.held_out))}"
+        )
+        if split.aside:
+            found.append(f"taking no part: {', '.join(split.aside)}")
+        if self.resumed:
+            found.append(f"{self.resumed} trials were done already")
+        elif self.others:
+            found.append(f"a new study: the {self.others} before were of another spec, log, range, seed or version")
+        return found
+
+    def run(self, trials: int = 60, jobs: int = 0) -> Iterator[Progress]:
+        """Run what is missing of this many trials on the training runs; tell after each run how far it is.
+
+        Raises:
+            ExperimentError: the data sheet's runs have no such score; no trial of the first batch came to its end.
+        """
+        yield self._progress(trials)
+        while waiting := self._ask(trials):
+            for _ in self._runs(waiting, self.tuning.split.train, jobs):
+                self._tell(waiting)
+                yield self._progress(trials)
+            self._tell(waiting)
+
+    def run_held_out(self, trials: Sequence[Trial], jobs: int = 0) -> Iterator[None]:
+        """Run these trials on what was held out; yields after each run."""
+        yield from self._runs({trial.number: trial.factors for trial in trials}, self.tuning.split.held_out, jobs)
+
+    def trials(self) -> list[Trial]:
+        """Return the trials whose runs have all ended, in their order."""
+        return [self._judged(trial.number, trial.params) for trial in self._study.trials if trial.state.is_finished()]
+
+    def rows(self, number: int, runs: Sequence[Run]) -> list[Row]:
+        """Return one row per run that has ended: of the objective's output, where there is such."""
+        found = [self._rows.get(self._key(number, run), []) for run in runs]
+        output = self.tuning.objective.output
+        return [next((row for row in rows if row["output"] == output), rows[0]) for rows in found if rows]
+
+    def _ask(self, trials: int) -> dict[int, dict[str, float]]:
+        """Return the trials that wait for runs, by number; asks for the next batch where none does.
+
+        A batch is asked for before any of it is known, and each trial's sampler has a seed of its own: so a search that
+        was stopped anywhere asks for what it would have asked for, on however many workers.
+        """
+        from optuna import create_study
+        from optuna.distributions import FloatDistribution
+        from optuna.samplers import TPESampler
+        from optuna.trial import TrialState, create_trial
+
+        asked, waiting = len(self._study.trials), self._waiting()
+        last = max(asked - 1, 0) // BATCH * BATCH
+        if not waiting:
+            end = (asked // BATCH + 1) * BATCH
+        else:  # a batch that was stopped while it was asked for is asked for to its end
+            end = last + BATCH if all(number in waiting for number in range(last, asked)) else asked
+        space = {dial: FloatDistribution(self.tuning.low, self.tuning.high, log=True) for dial in self.tuning.dials}
+        for number in range(asked, min(end, trials)):
+            sampler = TPESampler(seed=(self.tuning.seed * 1_000_003 + number) % 2**32, n_startup_trials=BATCH)
+            shadow = create_study(sampler=sampler)
+            shadow.add_trials(self._study.trials)
+            params = shadow.ask(space).params if number else dict.fromkeys(self.tuning.dials, 1.0)
+            self._study.add_trial(create_trial(state=TrialState.RUNNING, params=params, distributions=space))
+        return self._waiting()
+
+    def _waiting(self) -> dict[int, dict[str, float]]:
+        return {trial.number: trial.params for trial in self._study.trials if not trial.state.is_finished()}
+
+    def _runs(self, trials: Mapping[int, dict[str, float]], runs: Sequence[Run], jobs: int) -> Iterator[None]:
+        """Make the runs of these trials that are missing, log by log, and put each into the store as it ends."""
+        tasks = [
+            self.tuning.task(number, factors, run, self._scratch, self._study.study_name)
+            for run in runs
+            for number, factors in trials.items()
+            if not any(row["status"] in FINAL for row in self._rows.get(self._key(number, run), []))
+        ]
+        for rows in run_all(tasks, jobs):
+            kept = [{**row, "trajectory": None, "truth_trajectory": None} for row in rows]  # those go with the scratch
+            self._store.write(kept)
+            self._keep(kept)
+            yield
+
+    def _tell(self, waiting: Iterable[int]) -> None:
+        """Tell the study of every trial whose last run has ended; one that went wrong is worse than any that did not."""
+        from optuna.trial import TrialState
+
+        train = self.tuning.split.train
+        for number in sorted(self._waiting().keys() & set(waiting)):
+            if len(self.rows(number, train)) < len(train):
+                continue
+            trial = self._judged(number, {})
+            if trial.loss is None:
+                self._study.tell(number, state=TrialState.PRUNED)
+            else:
+                self._study.tell(number, trial.loss)
+        known = self.trials()
+        if len(known) >= min(BATCH, len(self._study.trials)) and all(trial.loss is None for trial in known):
+            raise ExperimentError(f"{self.tuning.estimator.label}: no trial came to its end; {known[0].cause}")
+
+    def _judged(self, number: int, factors: dict[str, float]) -> Trial:
+        objective, rows = self.tuning.objective, self.rows(number, self.tuning.split.train)
+        for row in rows:
+            if (cause := objective.lacking(row)) is not None:
+                return Trial(number, factors, None, cause)
+        marks = objective.marks(rows)
+        loss = float(objective.loss(marks.values, marks.weights))
+        return Trial(number, factors, loss) if math.isfinite(loss) else Trial(number, factors, None, f"loss is {loss}")
+
+    def _progress(self, trials: int) -> Progress:
+        known = self.trials()
+        return Progress(len(known), trials, best_of(known))
+
+    def _keep(self, rows: Iterable[Row]) -> None:
+        for key, of_run in groups([dict(row) for row in rows], "label", "log", "seed").items():
+            self._rows[key[0], key[1], key[2]] = of_run
+
+    def _key(self, number: int, run: Run) -> tuple[str, str, int | None]:
+        return f"{self._study.study_name} {number}", run.log.name, run.seed
+
+
+def best_of(trials: Sequence[Trial]) -> Trial | None:
+    """Return the trial of the smallest loss, the earliest of equals; None where no trial has one."""
+    return min((trial for trial in trials if trial.loss is not None), key=lambda trial: trial.loss or 0.0, default=None)
+
+
+@contextmanager
+def searching(tuning: Tuning) -> Iterator[Search]:
+    """Open the study and the store of a search, alone; make them where there are none.
+
+    Raises:
+        ExperimentError: optuna is missing; the files cannot be written, or are not such; another search is at it.
+    """
+    try:
+        import optuna
+        from sqlalchemy.exc import SQLAlchemyError
+    except ImportError as error:
+        raise ExperimentError(f"{error}; tuning needs an extra: pip install 'fathom-bench[tune]'") from None
+    path = tuning.folder / "study.sqlite"
+    try:
+        tuning.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExperimentError(f"{tuning.folder}: cannot be made ({error.strerror}); give another --out") from None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # what there is to say we say ourselves
+    with sole_writer(tuning.folder), Store(tuning.folder / "runs.sqlite") as store, TemporaryDirectory() as scratch:
+        try:
+            storage = optuna.storages.RDBStorage(f"sqlite:///{path}")
+            try:
+                study = optuna.create_study(storage=storage, study_name=tuning.identity, load_if_exists=True)
+                others = len(optuna.get_all_study_names(storage)) - 1
+                yield Search(tuning, study, others, store, Path(scratch))
+            finally:
+                storage.remove_session()
+                storage.engine.dispose()
+        except SQLAlchemyError as error:
+            raise ExperimentError(
+                f"{path}: cannot be used as a study ({error}); move it, or give another --out"
+            ) from None
