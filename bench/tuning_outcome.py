@@ -142,10 +142,11 @@ def judge(search: Search) -> Outcome:
         lost += [f"held out, {cause}" for cause in dict.fromkeys(causes)]
         if not causes and len(rows) == 2:
             pairs.append(rows)
-    held_out = tuple(objective.marks([pair[k] for pair in pairs]) for k in (0, 1)) if pairs else None
-    train = [None if trial.loss is None else objective.marks(search.rows(trial.number, tuning.split.train))
-             for trial in (sheet, best)]  # fmt: skip
-    return Outcome(tuning, trials, sheet, best, (train[0], train[1]), held_out, tuple(lost))
+    of_sheet, of_best = ([pair[k] for pair in pairs] for k in (0, 1))
+    held_out = (objective.marks(of_sheet), objective.marks(of_best)) if pairs else None
+    of_sheet, of_best = (search.rows(trial.number, tuning.split.train) for trial in (sheet, best))
+    train = (None if sheet.loss is None else objective.marks(of_sheet), objective.marks(of_best))
+    return Outcome(tuning, trials, sheet, best, train, held_out, tuple(lost))
 
 
 def write_outcome(outcome: Outcome) -> list[Path]:

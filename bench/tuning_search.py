@@ -1,8 +1,8 @@
 """Search an estimator's noise factors on training runs, and look once at what was held out.
 
-The search is a tree-structured Parzen estimator (optuna). Trial 0 is the data sheet, every factor 1. Each trial is a set
-of ordinary runs in worker processes; whatever is finished is in the store at once, so the same command goes on where it
-was stopped, and ends as if it had not been.
+The search is a tree-structured Parzen estimator (optuna). Trial 0 is the data sheet, every factor 1. Each trial is a
+set of ordinary runs in worker processes; whatever is finished is in the store at once, so the same command goes on
+where it was stopped, and ends as if it had not been.
 
 Source: Bergstra, Bardenet, Bengio & Kégl 2011, Algorithms for Hyper-Parameter Optimization, NeurIPS 24.
 """
@@ -22,7 +22,7 @@ from .runner import run_all
 from .store import Row, Store
 from .summary import groups, records
 from .tuning import Tuning
-from .tuning_sides import unit
+from .tuning_sides import in_words
 
 BATCH = 10
 """Trials asked for before any of them is run. It does not depend on how many workers there are, so trials do not."""
@@ -56,17 +56,15 @@ class Search:
     def __init__(self, tuning: Tuning, study: Any, others: int, store: Store, scratch: Path) -> None:
         self.tuning, self.others = tuning, others
         self._study, self._store, self._scratch = study, store, scratch
-        self._rows: dict[tuple[str, str, int | None], list[Row]] = {}
+        self._rows: dict[tuple[str, str, int | None], list[Any]] = {}
         self._keep(records(store.read()))
         self.resumed = len(self.trials())
 
     @property
     def notes(self) -> list[str]:
         """What the user should know before the search begins, in sentences."""
-        split, found = self.tuning.split, []
-        found.append(
-            f"training on {', '.join(map(unit, split.train))}; held out: {', '.join(map(unit, split.held_out))}"
-        )
+        split = self.tuning.split
+        found = [f"training on {in_words(split.train)}; held out: {in_words(split.held_out)}"]
         if split.aside:
             found.append(f"taking no part: {', '.join(split.aside)}")
         if self.resumed:
@@ -119,7 +117,9 @@ class Search:
             end = (asked // BATCH + 1) * BATCH
         else:  # a batch that was stopped while it was asked for is asked for to its end
             end = last + BATCH if all(number in waiting for number in range(last, asked)) else asked
-        space = {dial: FloatDistribution(self.tuning.low, self.tuning.high, log=True) for dial in self.tuning.dials}
+        space: dict[str, Any] = {
+            dial: FloatDistribution(self.tuning.low, self.tuning.high, log=True) for dial in self.tuning.dials
+        }
         for number in range(asked, min(end, trials)):
             sampler = TPESampler(seed=(self.tuning.seed * 1_000_003 + number) % 2**32, n_startup_trials=BATCH)
             shadow = create_study(sampler=sampler)
@@ -146,7 +146,7 @@ class Search:
             yield
 
     def _tell(self, waiting: Iterable[int]) -> None:
-        """Tell the study of every trial whose last run has ended; one that went wrong is worse than any that did not."""
+        """Tell the study of every trial whose last run has ended; one that went wrong is worse than all others."""
         from optuna.trial import TrialState
 
         train = self.tuning.split.train

@@ -26,6 +26,14 @@ def unit(run: Run) -> str:
     return run.log.name if run.seed is None else f"{run.log.name}/{run.seed}"
 
 
+def in_words(runs: Sequence[Run]) -> str:
+    """Return what the logs of these runs are called, each once, with its seeds."""
+    seeds: dict[str, list[str]] = {}
+    for run in runs:
+        seeds.setdefault(run.log.name, []).extend([] if run.seed is None else [str(run.seed)])
+    return "; ".join(f"{name}, seeds {', '.join(of)}" if of else name for name, of in seeds.items())
+
+
 def divide(experiment: Experiment, label: str, sides: Sides) -> Split:
     """Divide the runs of the estimator of this label; see `Sides`.
 
