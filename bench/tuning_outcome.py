@@ -82,11 +82,16 @@ class Outcome:
             )
         return found
 
-    def near(self, dial: str) -> tuple[float, float]:
-        """Return the smallest and the largest factor of a dial among the trials near the best."""
+    @property
+    def near_best(self) -> list[Trial]:
+        """The trials whose loss is near that of the best, see NEAR."""
         best = self.best.loss or 0.0
         limit = best + NEAR if self.tuning.objective.is_distance else best * (1 + NEAR)
-        factors = [trial.factors[dial] for trial in self.trials if trial.loss is not None and trial.loss <= limit]
+        return [trial for trial in self.trials if trial.loss is not None and trial.loss <= limit]
+
+    def near(self, dial: str) -> tuple[float, float]:
+        """Return the smallest and the largest factor of a dial among the trials near the best."""
+        factors = [trial.factors[dial] for trial in self.near_best]
         return min(factors), max(factors)
 
     def spec(self) -> str:
@@ -224,7 +229,8 @@ def print_outcome(outcome: Outcome, console: Console | None = None) -> None:
         _score(tuning, marks, interval) for marks, interval in ((outcome.train[1], False), (held[1], True))
     ))  # fmt: skip
     console.print(scores)
-    factors = Table("factor on sigma", "best", "within 1 % of it", "", box=box.SIMPLE_HEAD)
+    near = f"within 1 % of it: {len(outcome.near_best)} of {len(outcome.trials)} trials"
+    factors = Table("factor on sigma", "best", near, "", box=box.SIMPLE_HEAD)
     for dial in tuning.dials:
         low, high = outcome.near(dial)
         says = "hardly matters to this score" if high / low > FLAT else ""

@@ -58,7 +58,14 @@ class Search:
         self._study, self._store, self._scratch = study, store, scratch
         self._rows: dict[tuple[str, str, int | None], list[Any]] = {}
         self._keep(records(store.read()))
-        self.resumed = len(self.trials())
+        every = study.trials
+        self._waiting: dict[int, dict[str, float]] = {
+            trial.number: trial.params for trial in every if not trial.state.is_finished()
+        }
+        self._known = {
+            trial.number: self._judged(trial.number, trial.params) for trial in every if trial.state.is_finished()
+        }
+        self.resumed = len(self._known)
 
     @property
     def notes(self) -> list[str]:
@@ -82,9 +89,9 @@ class Search:
         yield self._progress(trials)
         while waiting := self._ask(trials):
             for _ in self._runs(waiting, self.tuning.split.train, jobs):
-                self._tell(waiting)
+                self._tell()
                 yield self._progress(trials)
-            self._tell(waiting)
+            self._tell()
 
     def run_held_out(self, trials: Sequence[Trial], jobs: int = 0) -> Iterator[None]:
         """Run these trials on what was held out; yields after each run."""
@@ -92,7 +99,7 @@ class Search:
 
     def trials(self) -> list[Trial]:
         """Return the trials whose runs have all ended, in their order."""
-        return [self._judged(trial.number, trial.params) for trial in self._study.trials if trial.state.is_finished()]
+        return [self._known[number] for number in sorted(self._known)]
 
     def rows(self, number: int, runs: Sequence[Run]) -> list[Row]:
         """Return one row per run that has ended: of the objective's output, where there is such."""
@@ -111,25 +118,25 @@ class Search:
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState, create_trial
 
-        asked, waiting = len(self._study.trials), self._waiting()
+        asked = len(self._known) + len(self._waiting)
         last = max(asked - 1, 0) // BATCH * BATCH
-        if not waiting:
+        if not self._waiting:
             end = (asked // BATCH + 1) * BATCH
         else:  # a batch that was stopped while it was asked for is asked for to its end
-            end = last + BATCH if all(number in waiting for number in range(last, asked)) else asked
-        space: dict[str, Any] = {
-            dial: FloatDistribution(self.tuning.low, self.tuning.high, log=True) for dial in self.tuning.dials
-        }
+            end = last + BATCH if all(number in self._waiting for number in range(last, asked)) else asked
+        factor = FloatDistribution(self.tuning.low, self.tuning.high, log=True)
+        space: dict[str, Any] = dict.fromkeys(self.tuning.dials, factor)
+        shadow = create_study()  # which may be asked for nothing by halves: the study gets whole trials
+        shadow.add_trials(self._study.trials)
+        if not asked:
+            shadow.enqueue_trial(dict.fromkeys(self.tuning.dials, 1.0))
         for number in range(asked, min(end, trials)):
-            sampler = TPESampler(seed=(self.tuning.seed * 1_000_003 + number) % 2**32, n_startup_trials=BATCH)
-            shadow = create_study(sampler=sampler)
-            shadow.add_trials(self._study.trials)
-            params = shadow.ask(space).params if number else dict.fromkeys(self.tuning.dials, 1.0)
+            seed = (self.tuning.seed * 1_000_003 + number) % 2**32
+            shadow.sampler = TPESampler(seed=seed, n_startup_trials=BATCH)
+            params = shadow.ask(space).params
             self._study.add_trial(create_trial(state=TrialState.RUNNING, params=params, distributions=space))
-        return self._waiting()
-
-    def _waiting(self) -> dict[int, dict[str, float]]:
-        return {trial.number: trial.params for trial in self._study.trials if not trial.state.is_finished()}
+            self._waiting[number] = params
+        return dict(self._waiting)
 
     def _runs(self, trials: Mapping[int, dict[str, float]], runs: Sequence[Run], jobs: int) -> Iterator[None]:
         """Make the runs of these trials that are missing, log by log, and put each into the store as it ends."""
@@ -145,21 +152,22 @@ class Search:
             self._keep(kept)
             yield
 
-    def _tell(self, waiting: Iterable[int]) -> None:
+    def _tell(self) -> None:
         """Tell the study of every trial whose last run has ended; one that went wrong is worse than all others."""
         from optuna.trial import TrialState
 
         train = self.tuning.split.train
-        for number in sorted(self._waiting().keys() & set(waiting)):
+        for number, factors in sorted(self._waiting.items()):
             if len(self.rows(number, train)) < len(train):
                 continue
-            trial = self._judged(number, {})
+            trial = self._known[number] = self._judged(number, factors)
+            del self._waiting[number]
             if trial.loss is None:
                 self._study.tell(number, state=TrialState.PRUNED)
             else:
                 self._study.tell(number, trial.loss)
         known = self.trials()
-        if len(known) >= min(BATCH, len(self._study.trials)) and all(trial.loss is None for trial in known):
+        if known and not self._waiting and all(trial.loss is None for trial in known):
             raise ExperimentError(f"{self.tuning.estimator.label}: no trial came to its end; {known[0].cause}")
 
     def _judged(self, number: int, factors: dict[str, float]) -> Trial:
