@@ -386,10 +386,10 @@ def tune(
     """
     with refusing_bad_input():
         from .experiment import Experiment, Sides
-        from .tuning import prepare
-        from .tuning_objective import Objective
-        from .tuning_outcome import judge, print_outcome, run_with_bar, write_outcome
-        from .tuning_search import searching
+        from .tuning.objective import Objective
+        from .tuning.outcome import judge, print_outcome, run_with_bar, write_outcome
+        from .tuning.search import searching
+        from .tuning.tuning import prepare
 
         plan, sides = Experiment.load(experiment), Sides(tuple(train or ()), tuple(held_out or ()))
         objective = Objective(score, output.value)

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from fathom.bench import tuning_search
 from fathom.bench.cli import app
 from fathom.bench.experiment import Experiment, ExperimentError, Sides
-from fathom.bench.tuning import Tuning, prepare
-from fathom.bench.tuning_objective import DUE, SCORES, Marks, Objective
-from fathom.bench.tuning_outcome import Outcome, judge, write_outcome
-from fathom.bench.tuning_search import Trial, searching
+from fathom.bench.tuning import search as tuning_search
+from fathom.bench.tuning.objective import DUE, SCORES, Marks, Objective
+from fathom.bench.tuning.outcome import Outcome, judge, write_outcome
+from fathom.bench.tuning.search import Trial, searching
+from fathom.bench.tuning.tuning import Tuning, prepare
+from fathom.bench.working import Finished
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.errors import DatasetError
 from fathom.datasets.folder import write_folder
@@ -177,16 +178,16 @@ class Sea:
     def __init__(self, law: Law, stop_after: float = math.inf) -> None:
         self.law, self.stop_after, self.asked = law, stop_after, []
 
-    def run_all(self, tasks: Sequence[Any], jobs: int = 0) -> Iterator[list[dict[str, Any]]]:
+    def run_all(self, tasks: Sequence[Any], jobs: int = 0) -> Iterator[Finished]:
         for task in tasks:
             if len(self.asked) >= self.stop_after:
                 raise KeyboardInterrupt
             self.asked.append((task.run.log.name, task.run.seed))
             value = self.law(task.run.estimator.options["inflate"], task.run.log.name, task.run.seed)
             if value is None:
-                yield [task.row("diverged", "lost")]
+                yield Finished([task.row("diverged", "lost")])
             else:
-                yield [task.row("done", None) | {"ate_rmse_m": value, "n_scored": 10}]
+                yield Finished([task.row("done", None) | {"ate_rmse_m": value, "n_scored": 10}])
 
 
 def valley(factors: dict[str, float], log: str, seed: int | None) -> float:

@@ -16,12 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from .drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
-from .experiment import ExperimentError
-from .paired import FEWEST_SEEDS
+from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
+from ..experiment import ExperimentError
+from ..paired import FEWEST_SEEDS
+from .objective import DUE, Marks
+from .search import Search, Trial, best_of
 from .tuning import Tuning
-from .tuning_objective import DUE, Marks
-from .tuning_search import Search, Trial, best_of
 
 NEAR = 0.01
 """A trial is near the best where its loss is within 1 % of the best's (of a distance: within 0.01)."""

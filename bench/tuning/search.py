@@ -12,17 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from .experiment import ExperimentError, Run
-from .ledger import FINAL, sole_writer
-from .runner import run_all
-from .store import Row, Store
-from .summary import groups, records
+from ..experiment import ExperimentError, Run
+from ..ledger import FINAL, sole_writer
+from ..store import Row, Store
+from ..summary import groups, records
+from ..workers import run_all
+from .sides import in_words
 from .tuning import Tuning
-from .tuning_sides import in_words
 
 BATCH = 10
 """Trials asked for before any of them is run. It does not depend on how many workers there are, so trials do not."""
@@ -53,9 +51,9 @@ class Search:
         others: how many other studies there are: of another spec, log, range, version or seed.
     """
 
-    def __init__(self, tuning: Tuning, study: Any, others: int, store: Store, scratch: Path) -> None:
+    def __init__(self, tuning: Tuning, study: Any, others: int, store: Store) -> None:
         self.tuning, self.others = tuning, others
-        self._study, self._store, self._scratch = study, store, scratch
+        self._study, self._store = study, store
         self._rows: dict[tuple[str, str, int | None], list[Any]] = {}
         self._keep(records(store.read()))
         every = study.trials
@@ -141,13 +139,13 @@ class Search:
     def _runs(self, trials: Mapping[int, dict[str, float]], runs: Sequence[Run], jobs: int) -> Iterator[None]:
         """Make the runs of these trials that are missing, log by log, and put each into the store as it ends."""
         tasks = [
-            self.tuning.task(number, factors, run, self._scratch, self._study.study_name)
+            self.tuning.task(number, factors, run, self._study.study_name)
             for run in runs
             for number, factors in trials.items()
             if not any(row["status"] in FINAL for row in self._rows.get(self._key(number, run), []))
         ]
-        for rows in run_all(tasks, jobs):
-            kept = [{**row, "trajectory": None, "truth_trajectory": None} for row in rows]  # those go with the scratch
+        for finished in run_all(tasks, jobs):
+            kept = [{**row, "trajectory": None, "truth_trajectory": None} for row in finished.rows]  # nobody looks
             self._store.write(kept)
             self._keep(kept)
             yield
@@ -214,13 +212,13 @@ def searching(tuning: Tuning) -> Iterator[Search]:
     except OSError as error:
         raise ExperimentError(f"{tuning.folder}: cannot be made ({error.strerror}); give another --out") from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what there is to say we say ourselves
-    with sole_writer(tuning.folder), Store(tuning.folder / "runs.sqlite") as store, TemporaryDirectory() as scratch:
+    with sole_writer(tuning.folder), Store(tuning.folder / "runs.sqlite") as store:
         try:
             storage = optuna.storages.RDBStorage(f"sqlite:///{path}")
             try:
                 study = optuna.create_study(storage=storage, study_name=tuning.identity, load_if_exists=True)
                 others = len(optuna.get_all_study_names(storage)) - 1
-                yield Search(tuning, study, others, store, Path(scratch))
+                yield Search(tuning, study, others, store)
             finally:
                 storage.remove_session()
                 storage.engine.dispose()

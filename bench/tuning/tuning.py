@@ -11,15 +11,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from ..datasets.errors import nearest
-from ..datasets.log import Log
-from ..datasets.opening import RecordingNotFound
-from .experiment import EstimatorSpec, Experiment, ExperimentError, Run, Sides
-from .ledger import content_sha256
-from .run import can_judge
-from .runner import Task
-from .tuning_objective import Objective
-from .tuning_sides import Split, divide
+from ...datasets.errors import nearest
+from ...datasets.log import Log
+from ...datasets.opening import RecordingNotFound
+from ..experiment import EstimatorSpec, Experiment, ExperimentError, Run, Sides
+from ..ledger import content_sha256
+from ..run import can_judge
+from ..working import Task
+from .objective import Objective
+from .sides import Split, divide
 
 IMU = ("accel", "gyro")
 
@@ -56,7 +56,7 @@ class Tuning:
     @property
     def identity(self) -> str:
         """What tells this study from any other: all that decides a trial's loss, and where the next is looked for."""
-        sheet = [self.task(0, {}, run, Path()).identity for run in self.split.train]
+        sheet = [self.task(0, {}, run).identity for run in self.split.train]
         decides = [sheet, self.dials, self.objective.score, self.objective.output, self.low, self.high, self.seed]
         return sha256(json.dumps(decides).encode()).hexdigest()[:12]
 
@@ -65,11 +65,12 @@ class Tuning:
         inflate = {**self.estimator.options.get("inflate", {}), **factors}
         return self.estimator.options | {"inflate": inflate}
 
-    def task(self, number: int, factors: Mapping[str, float], run: Run, scratch: Path, study: str = "") -> Task:
+    def task(self, number: int, factors: Mapping[str, float], run: Run, study: str = "") -> Task:
         """Return one run of a trial."""
         spec = replace(self.estimator, label=f"{study} {number}".strip(), options=self.options(factors))
         readings = run.log.path_sha256 if run.seed is not None else self.readings.get(run.log.name)
-        return Task(self.experiment, run._replace(estimator=spec), scratch, self.data, self.repair, readings)
+        task = Task.of(self.experiment, run._replace(estimator=spec), self.data, self.repair)
+        return replace(task, readings_sha256=readings)
 
 
 def prepare(

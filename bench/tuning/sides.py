@@ -7,8 +7,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-from ..datasets.opening import catalog_names
-from .experiment import Experiment, ExperimentError, Run, Sides
+from ...datasets.opening import catalog_names
+from ..experiment import Experiment, ExperimentError, Run, Sides
 
 NAME_THEM = 'name them: `tune: {train: [...], held_out: [...]}`, or --train and --held-out, by log or by "log/seed"'
 

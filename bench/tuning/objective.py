@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from ..datasets.errors import nearest
-from ..datasets.state import Array
-from .experiment import ExperimentError
-from .floor_ratio import FLOORS
-from .paired import FEWEST_SEEDS, OVER_SEEDS, TAKE, bootstrap_interval
-from .run import INNOVATIONS
-from .summary import MEDIAN, POOLED
+from ...datasets.errors import nearest
+from ...datasets.state import Array
+from ..experiment import ExperimentError
+from ..floor_ratio import FLOORS
+from ..paired import FEWEST_SEEDS, OVER_SEEDS, TAKE, bootstrap_interval
+from ..run import INNOVATIONS
+from ..summary import MEDIAN, POOLED
 
 DUE: dict[str, float] = (
     dict.fromkeys(INNOVATIONS, 1.0)
