@@ -38,7 +38,7 @@ def print_reproduction(every: Sequence[Again], console: Console | None = None) -
     if run:
         _print_facts(run, console)
         console.print(_verdicts(run, most=None if len(run) == 1 else 1))
-    for line in dict.fromkeys(_sentences(every)):
+    for line in _sentences(every):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -95,14 +95,22 @@ def _difference(each: Difference) -> list[str]:
 
 def _sentences(every: Sequence[Again]) -> list[str]:
     """Return what is to be said of single runs, and the sum."""
-    lines = [f"{again.stored.name}: {remark}" for again in every for remark in again.remarks]
-    lines += [f"{again.stored.name}: not run again: {again.skipped}" for again in every if again.skipped is not None]
+    told = [(remark, again.stored.name) for again in every for remark in again.remarks]
+    told += [(f"not run again: {again.skipped}", again.stored.name) for again in every if again.skipped is not None]
+    names: dict[str, list[str]] = {}
+    for sentence, name in told:
+        names.setdefault(sentence, []).append(name)
+    lines = [f"{_several(of)}: {sentence}" for sentence, of in names.items()]
     run = [again for again in every if again.skipped is None]
     ratios = [again.time_ratio for again in run if again.time_ratio is not None]
     took = f"; computing took {median(ratios):.2f} times as long (median), which is not compared" if ratios else ""
     same = sum(again.is_identical for again in run)
     lines.append(f"{same} of {len(run)} runs came out identical, bit for bit{took}")
     return lines
+
+
+def _several(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _empty(first: str, headings: Sequence[str]) -> Table:

@@ -9,10 +9,12 @@ from math import nextafter
 from pathlib import Path
 from shutil import copytree, rmtree
 
+import numpy as np
 import pytest
 from fathom.bench import ledger, machine, reproduce, runner
 from fathom.bench.cli import app
 from fathom.bench.experiment import Experiment
+from fathom.bench.floor import floors
 from fathom.bench.reproduce import compare, rebuild, reproduce_all
 from fathom.bench.runner import run_experiment
 from fathom.bench.stored import choose
@@ -206,7 +208,9 @@ def test_a_run_that_cannot_be_made_again_says_why(result: Path, assignment: str,
     assert says in out
     code, out, _ = call("reproduce", result)
     assert code == (0 if "absent" in assignment else 1)
+    assert "short dive/eskf gated/3 and 1 more: not run again: " in out
     assert says in out
+    assert out.count("not run again") == 1
     assert "4 of 4 runs came out identical" in out
 
 
@@ -322,6 +326,13 @@ def test_a_rebuilt_task_has_the_spec_and_identity_of_its_row(made: Path) -> None
         assert json.loads(json.dumps(task.spec)) == stored.spec
         assert task.identity == stored.first["identity"]
         assert compare(stored, stored).is_identical
+
+
+def test_a_floor_does_not_depend_on_the_lags_that_it_is_found_with() -> None:
+    scenario, ticks_ns = Scenario(duration_s=30.0, gps={"delay_s": 2.0}), np.arange(5, 30) * 10**9
+    together = floors(scenario, 1, ticks_ns, [0.0, 1.0, 3.0, 10.0, np.inf])
+    for lag_s, floor in together.items():
+        assert np.array_equal(floors(scenario, 1, ticks_ns, sorted({0.0, lag_s, np.inf}))[lag_s].P, floor.P)
 
 
 def test_every_option_of_every_estimator_survives_the_store() -> None:
