@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +24,7 @@ from .summary import UNFINISHED, Record, file_names, groups, records
 from .table import _caption
 
 ABSENT = "--"
-LONG = 30
+LONG = 24
 """Longer labels than this are broken into lines."""
 
 
@@ -42,9 +43,9 @@ COLUMNS = (
     Column("drift_end_percent", ("drift", "(%)")),
     Column("rpe_rmse_m", ("RPE", "(m)")),
     Column("nees_position", ("NEES", "per dof"), best=None, divisor=3.0),
-    Column("step_median_us", ("step, median", "(µs)")),
-    Column("step_p99_us", ("step, p99", "(µs)")),
-    Column("real_time_factor", ("real-time", "factor"), best=max),
+    Column("step_median_us", ("step p50", "(µs)")),
+    Column("step_p99_us", ("step p99", "(µs)")),
+    Column("real_time_factor", ("× real", "time"), best=max),
 )
 COSTS = ("step_median_us", "step_p99_us", "real_time_factor")
 BLOCKS = {"online": "At once", "hindsight": "With hindsight"}
@@ -76,8 +77,9 @@ def _table(summary: Sequence[Record], rows: Sequence[Record], label: str) -> str
         rf"\label{{{label}}}",
         r"\smallskip",
         r"\footnotesize",
-        r"\setlength{\tabcolsep}{3.5pt}",
-        rf"\begin{{tabular}}{{@{{}}{'p{42mm}' if long else 'l'}rl{'r' * len(COLUMNS)}@{{}}}}",
+        r"\setlength{\tabcolsep}{3pt}",
+        rf"\renewcommand{{\arraystretch}}{{{1.4 if _has_intervals(summary) else 1.1}}}",
+        rf"\begin{{tabular}}{{@{{}}{'p{29mm}' if long else 'l'}rl{'r' * len(COLUMNS)}@{{}}}}",
         r"\toprule",
         *(_line(escape(head[k]) for head in heads) for k in (0, 1)),
     ]
@@ -98,7 +100,8 @@ def _line(cells: Iterable[str]) -> str:
 def _label(label: str, long: bool) -> str:
     text = escape(label)
     if long:
-        return rf"\raggedright {text}"
+        breakable = re.sub(r"(\\_|/|-)(?=[^\W_])", r"\1\\allowbreak{}", text)
+        return rf"\raggedright {breakable}"
     return f"{{}}{text}" if text.startswith(("[", "*")) else text  # `\\` before it would take that for its own
 
 
@@ -162,12 +165,11 @@ def number(value: float, low: float | None = None, high: float | None = None, bo
 def _caption_of(summary: Sequence[Record], rows: Sequence[Record]) -> str:
     """Return what a reader must know to compare the numbers: seeds, alignment, what they are and which are bold."""
     scored = next((row for row in summary if row["truth_kind"] is not None), summary[0])
-    intervals = any(row[f"{score}_low"] is not None for row in summary for score in TABLED)
     seeds = sorted({row["seed"] for row in rows if row["seed"] is not None})
     sentences = [f"{summary[0]['log']}: {_seeds(seeds)}; {_caption(scored)}"]
     if len(seeds) > 1:
         sentences.append("RMSEs are pooled over seeds before the root, drift and NEES are means, costs medians")
-    if intervals:
+    if _has_intervals(summary):
         sentences.append(
             "Beside a number: the ends of its 95 % interval, less itself"
             " (bootstrap over seeds, bias-corrected and accelerated)"
@@ -195,6 +197,10 @@ def _seeds(seeds: Sequence[int]) -> str:
     ends = [*(a for a, b in pairwise(seeds) if b != a + 1), seeds[-1]]
     which = [f"{a}" if a == b else f"{a}, {b}" if b == a + 1 else f"{a}–{b}" for a, b in zip(starts, ends, strict=True)]
     return f"{len(seeds)} seed{'s' if len(seeds) > 1 else ''} ({', '.join(which)})"
+
+
+def _has_intervals(summary: Sequence[Record]) -> bool:
+    return any(row[f"{score}_low"] is not None for row in summary for score in TABLED)
 
 
 def _is_examined(rows: Sequence[Record]) -> bool:

@@ -51,9 +51,10 @@ def test_run_writes_store_table_and_figures_and_prints_the_table(tmp_path: Path)
     assert "alignment: none" in out
     folder = tmp_path / "r" / "short"
     assert pd.read_csv(folder / "table.csv")["done"].tolist() == [1, 1]
+    assert r"\toprule" in (folder / "table.tex").read_text()
     assert pd.read_csv(folder / "consistency.csv")["seeds"].unique().tolist() == [1]
     assert (folder / "runs.sqlite").is_file()
-    assert len(list((folder / "figures").glob("*.pdf"))) == 3
+    assert len(list((folder / "figures").glob("*.pdf"))) == 5
 
 
 def test_a_failed_run_is_named_on_the_last_line_and_exits_1(tmp_path: Path) -> None:
