@@ -192,7 +192,7 @@ def test_the_ends_of_an_interval_have_the_decimals_of_their_number() -> None:
 COMMAND = re.compile(r"\\(?:[A-Za-z]+|.)|\$|[{}]|[^\\${}]")
 
 
-@given(st.text(max_size=40))
+@given(st.text(st.one_of(st.sampled_from([*ESCAPED, *ACCENTS]), st.characters()), max_size=40))
 def test_any_text_is_ascii_with_balanced_braces_and_nothing_special(text: str) -> None:
     depth, mathematics = 0, False
     for token in COMMAND.findall(escape(text)):
