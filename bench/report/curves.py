@@ -21,7 +21,7 @@ SYMBOL = {
     "X": "x",
     "*": "star",
 }
-DASH = dict(zip(DASHES, ("solid", "dash", "dot", "dashdot"), strict=True))
+DASH: dict[Any, str] = dict(zip(DASHES, ("solid", "dash", "dot", "dashdot"), strict=True))
 
 
 def looks(of: Mapping[str, Look]) -> dict[str, Any]:

@@ -158,7 +158,12 @@
 
   function draw(plot) {
     const [traces, layout] = DRAW[plot.dataset.kind](plot.closest(".log"));
-    const config = { displaylogo: false, typesetMath: false, doubleClick: "reset", modeBarButtonsToRemove: ["select2d", "lasso2d"], toImageButtonOptions: { format: "svg" } };
+    // plotly's own choice of buttons has one that uploads the figure
+    const config = {
+      displaylogo: false, typesetMath: false, showTips: false, doubleClick: "reset",
+      modeBarButtons: [["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
+      toImageButtonOptions: { format: "svg" },
+    };
     drawn.set(plot, plot.clientWidth);
     return Plotly.react(plot, traces, dressed(layout, plot, traces), config);
   }

@@ -76,7 +76,7 @@ def in_order(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
         column: {name: place for place, name in enumerate(dict.fromkeys([*first, *rows[column]]))}
         for column, first in zip(("log", "label"), known, strict=True)
     }
-    place = pd.DataFrame({column: rows[column].map(of) for column, of in places.items()})
+    place = pd.DataFrame({column: [of[name] for name in rows[column]] for column, of in places.items()}, rows.index)
     return rows.loc[place.assign(seed=rows["seed"]).sort_values(["log", "seed", "label"], kind="stable").index]
 
 

@@ -240,7 +240,8 @@ def differences(paired: Sequence[Record]) -> list[Sheet]:
                 *(row["baseline"], row["difference"], row["low"], row["ratio"]),
                 *(row["p_holm"], row["rank_biserial"], row["pairs"]),
             ]
-            group = f"{score_name(row['score'])}, sees {_both_lookaheads(row)} ahead"
+            ahead = f"sees {_both_lookaheads(row)} ahead" if row["pairs"] else "no seed that both came to the end of"
+            group = f"{score_name(row['score'])}, {ahead}"
             cells = [Cell(text, value) for text, value in zip(texts, values, strict=True)]
             lines.setdefault(group, []).append(Line(who(row), cells))
         sheets.append(Sheet(f"{log}: against {label}", note, headings, lines))

@@ -114,7 +114,7 @@ def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]
                 "output": track.output,
                 "ahead": lookahead(row),
                 "near": _is_near(track),
-                "t": floats((track.estimate.t_ns[::every] - start_ns) * 1e-9),
+                "t": floats(1e-9 * (track.estimate.t_ns[::every] - start_ns).astype(float)),
                 "p": _coordinates(track.estimate.p_WB_W[::every, :2]),
                 "error": _errors(track, every),
                 "sigma": _sigmas(track, every),

@@ -153,6 +153,15 @@ def test_the_page_alone_opens_and_draws_every_figure_without_network_or_complain
     assert outside == []
 
 
+def test_a_figure_can_be_saved_and_has_no_button_that_sends_it_anywhere(page: Any) -> None:
+    plot = drawn(page, "tracks")
+    titles = plot.locator(".modebar-btn").evaluate_all("buttons => buttons.map((button) => button.dataset.title)")
+    assert titles == ["Download plot", "Zoom", "Pan", "Zoom in", "Zoom out", "Reset axes"]
+    with page.expect_download() as download:
+        plot.locator(".modebar-btn").first.click(force=True)
+    assert download.value.path().read_text(encoding="utf-8").startswith("<svg")
+
+
 def test_the_watch_sees_a_request(folder: Path, browser: Any, tmp_path: Path) -> None:
     text = (folder / "report.html").read_text(encoding="utf-8")
     beacon = '<img src="http://127.0.0.1:9/seen.png" alt="">'
