@@ -406,6 +406,8 @@ def tune(
         files = write_outcome(outcome)
         print_outcome(outcome)
         _say(f"{tuning.folder}: {', '.join(file.name for file in files)}, study.sqlite, runs.sqlite")
+    if outcome.lost:
+        raise typer.Exit(SOME_FAILED)
 
 
 @app.command()
