@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -123,7 +123,7 @@ def _steps(
     log_name: str,
     unit: str,
     name: str,
-    sensors: Iterable[str] | None = None,
+    sensors: Collection[str] | None = None,
     first_s: float = math.inf,
     **options: Any,
 ) -> Work:
@@ -239,7 +239,13 @@ def _harness(folder: Path) -> Work:
     from ..run import run_log, scores
 
     log, estimator = _log(folder, "minute"), create("dead-reckoning", attitude="heading")
-    return Work(lambda: scores(log, run_log(log, estimator).online), len(log.imu.t_ns))
+
+    def do() -> object:
+        online = run_log(log, estimator).online
+        assert online is not None
+        return scores(log, online)
+
+    return Work(do, len(log.imu.t_ns))
 
 
 def _tables(folder: Path) -> Work:

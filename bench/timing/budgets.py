@@ -24,7 +24,7 @@ from ...datasets.folder import write_folder
 from ...estimators import create
 from ..experiment import Experiment
 from ..metrics import ate
-from ..run import run_log, score_ticks, scores, warm_up
+from ..run import Result, run_log, score_ticks, scores, warm_up
 from ..workers import run_all
 from ..working import Task
 from . import evo
@@ -99,6 +99,7 @@ def _stepping(log: Log, name: str, **options: Any) -> Callable[[], Any]:
     estimator, epochs = create(name, **options), cut(log, score_ticks(log, 1.0)).epochs
 
     def steps() -> Any:
+        assert log.prior is not None
         one = estimator.begin(log.prior, log.rig)
         for epoch in epochs:
             one.step(epoch)
@@ -139,18 +140,25 @@ def python_factor() -> Measured:
         for _ in range(5000):
             factor.linearize(values)
 
-    many(ours), many(native)
+    many(ours)
+    many(native)
     return Measured(take_turns(partial(many, ours), partial(many, native), 7))
 
 
 def window_against_fls(lag_s: float) -> Measured:
     """Measure how much longer than `window` the cheapest setting of `fls` takes whose RMSE is within 1 % of its."""
     log = _simulated(90.0)
-    best = ate(log.truth, run_log(log, create("window", lag_s=lag_s)).online).rmse_m
+
+    def rmse_m(result: Result) -> float:
+        assert log.truth is not None
+        assert result.online is not None, result.cause
+        return ate(log.truth, result.online).rmse_m
+
+    best = rmse_m(run_log(log, create("window", lag_s=lag_s)))
     good = []
     for options in CHEAPER:
         result = run_log(log, create("fls", lag_s=lag_s, **options))
-        if result.status == "done" and ate(log.truth, result.online).rmse_m <= 1.01 * best:
+        if result.status == "done" and rmse_m(result) <= 1.01 * best:
             good.append((int(result.step_ns.sum()), options))
     assert good, "no setting of fls is as good"
     options = min(good, key=lambda each: each[0])[1]
@@ -257,7 +265,8 @@ def help_against_numpy() -> Measured:
         return after.children_user + after.children_system - before.children_user - before.children_system
 
     ask, load = partial(seconds, "-m", "fathom.bench.cli", "--help"), partial(seconds, "-c", "import numpy")
-    ask(), load()
+    ask()
+    load()
     return Measured(tuple(min(ask(), ask()) / min(load(), load()) for _ in range(5)))
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import gtsam
-from numba.core.runtime import _nrt_python as numba_memory
+from numba.core.runtime import _nrt_python as numba_memory  # pyright: ignore[reportAttributeAccessIssue]
 
 from ...datasets import Log, Scenario, simulate
 from ...datasets.epochs import Epoch, cut
@@ -80,7 +80,8 @@ def count(name: str) -> dict[str, float]:
 
 def _driven(log: Log, name: str, options: dict[str, Any], drive: Callable[..., object]) -> tuple[Any, list[int]]:
     """Return a pass after all its steps, and how many variables GTSAM linearised anew, as one number in a list."""
-    one: Any = create(name, **options).begin(log.prior, log.rig)  # type: ignore[arg-type]  # simulated: it has a prior
+    assert log.prior is not None
+    one: Any = create(name, **options).begin(log.prior, log.rig)
     relinearised = [0]
     if name == "fls":
         update = one._solver.update
@@ -106,11 +107,11 @@ def _callbacks() -> Iterator[list[int]]:
 
         return made(model, keys, counting)
 
-    gtsam.CustomFactor = factor  # type: ignore[misc]
+    gtsam.CustomFactor = factor
     try:
         yield called
     finally:
-        gtsam.CustomFactor = made  # type: ignore[misc]
+        gtsam.CustomFactor = made
 
 
 def _python_calls(step: Callable[[Epoch], None], epochs: list[Epoch]) -> int:

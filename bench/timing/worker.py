@@ -29,7 +29,7 @@ def load(packages: Path, benchmarks: Path) -> dict[str, Any]:
     assert spec.loader is not None
     module = sys.modules[HOME] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    import fathom.bench  # type: ignore[import-not-found]  # of PACKAGES, whatever else is installed
+    import fathom.bench  # of PACKAGES, whatever else is installed
 
     assert Path(fathom.bench.__path__[0]).parents[1] == packages, fathom.bench.__path__
     return {each.name: each for each in module.BENCHMARKS}
