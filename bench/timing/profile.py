@@ -119,12 +119,16 @@ def profile_table(profiles: Sequence[Profile]) -> Table:
         times = [row["us_per_step"], row["us_per_imu_sample"], row["us_per_keyframe"]]
         table.add_row(
             one.label,
-            *("–" if us is None else f"{us:.3g}" if float(us) < 1000 else f"{float(us):,.0f}" for us in times),
+            *("–" if us is None else _us(float(us)) for us in times),
             *(f"{100 * share:.1f}" for share in one.shares.values()),
             f"{one.timed.finish_ns / 1e6:,.1f}",
             f"{100 * one.overhead:.0f}",
         )
     return table
+
+
+def _us(value: float) -> str:
+    return f"{value:.3g}" if value < 1000 else f"{value:,.0f}"
 
 
 def draw_profile(profiles: Sequence[Profile], title: str) -> Figure:
@@ -137,7 +141,7 @@ def draw_profile(profiles: Sequence[Profile], title: str) -> Figure:
         axes.barh(list(places), widths, left=left, height=0.7, color=colour, label=part)
         left = [a + b for a, b in zip(left, widths, strict=True)]
     for place, one in zip(places, profiles, strict=True):
-        axes.text(101, place, f"{one.plain_ns / len(one.timed.step_ns) / 1e3:,.3g} µs", va="center", fontsize=7)
+        axes.text(101, place, f"{_us(one.plain_ns / len(one.timed.step_ns) / 1e3)} µs", va="center", fontsize=7)
     axes.set_yticks(list(places), [one.label for one in profiles])
     axes.set_xlim(0, 112)
     axes.set_xticks(range(0, 101, 20))

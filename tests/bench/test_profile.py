@@ -54,6 +54,7 @@ def test_every_nanosecond_belongs_to_one_part_and_of_two_to_the_greater() -> Non
     begun, started = totals(), perf_counter_ns()
     enter(int(Part.REST))
     work(int(Part.SOLVE))
+    solved = totals()
     enter(int(Part.OUTPUT))
     work(int(Part.SOLVE))  # is done for the output
     work(int(Part.MARGINAL))
@@ -62,7 +63,8 @@ def test_every_nanosecond_belongs_to_one_part_and_of_two_to_the_greater() -> Non
     elapsed_ns = perf_counter_ns() - started
     spent = dict(zip(PARTS, (totals() - begun).tolist(), strict=True))
     assert BOARD[0] == 0
-    assert min(spent["solve"], spent["output"], spent["marginal"]) > 0.2 * spent["output"] > 0
+    assert spent["solve"] == (solved - begun)[Part.SOLVE] > 0
+    assert min(spent["output"], spent["marginal"]) > 0
     assert spent["propagation"] == spent["linearisation"] == 0
     inside_ns = sum(ns for part, ns in spent.items() if part != "idle")
     assert 0.9 * elapsed_ns < inside_ns <= elapsed_ns
