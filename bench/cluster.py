@@ -23,8 +23,8 @@ from uuid import uuid4
 
 from .experiment import ExperimentError
 from .remote import Greeting, dismiss, do, greet, greeting
+from .task import Finished, Task
 from .workers import Queue
-from .working import Finished, Task
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -74,14 +74,14 @@ def _connected(address: str, jobs: int) -> Iterator[Client]:
     if address == "local":
         from dask.config import set as configured
 
-        no_dashboard: Any = None  # what it wants, and not what it declares
         with (
             configured({"distributed.scheduler.worker-ttl": None}),
             LocalCluster(
                 n_workers=jobs,
                 threads_per_worker=1,
                 memory_limit=0,
-                dashboard_address=no_dashboard,
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=CRITICAL,
                 preload=[f"{__package__}.remote"],
             ) as cluster,

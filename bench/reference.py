@@ -20,8 +20,9 @@ from ..estimators.interface import Estimator
 from .experiment import Experiment, LogSpec, Run, shipped_experiments
 from .store import Store
 from .summary import Record, groups, records, summarise
+from .task import Task
 from .variants import changed
-from .working import Bench, Task
+from .working import Bench
 
 SHORT = {
     "duration_s": 40.0,

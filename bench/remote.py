@@ -20,8 +20,8 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .task import Finished, Task
     from .workers import Worker
-    from .working import Finished, Task
 
 
 @dataclass(frozen=True)

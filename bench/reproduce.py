@@ -21,8 +21,8 @@ from .run import INNOVATIONS, SCORES, Scoring
 from .store import COLUMNS, Row, provenance
 from .stored import Stored, facts
 from .summary import Record
+from .task import Task
 from .workers import run_all
-from .working import Task
 
 COMPARED = ("status", "cause", "failed_at_s", "lookahead_s", "truth_kind", "duration_s", "start")
 COMPARED += (*SCORES, *FLOORS, *INNOVATIONS)

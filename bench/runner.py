@@ -19,8 +19,8 @@ from .cold_start import compile_first
 from .experiment import Experiment, ExperimentError, Run
 from .ledger import content_sha256, sole_writer
 from .store import Row, Store, provenance
+from .task import Task
 from .workers import run_all
-from .working import Task
 
 
 def run_experiment(

@@ -14,7 +14,7 @@ from multiprocessing.connection import wait
 from subprocess import PIPE, Popen, TimeoutExpired
 from typing import Any, TypeAlias
 
-from .working import Finished, Task
+from .task import Finished, Task
 
 THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")
 """What libraries read when a process starts; timings are single-threaded."""

@@ -25,8 +25,8 @@ from ...estimators import create
 from ..experiment import Experiment
 from ..metrics import ate
 from ..run import Result, run_log, score_ticks, scores, warm_up
+from ..task import Task
 from ..workers import run_all
-from ..working import Task
 from . import evo
 
 LAGS_S = (3.0, 10.0, 30.0)

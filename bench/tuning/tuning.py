@@ -17,7 +17,7 @@ from ...datasets.opening import RecordingNotFound
 from ..experiment import EstimatorSpec, Experiment, ExperimentError, Run, Sides
 from ..ledger import content_sha256
 from ..run import can_judge
-from ..working import Task
+from ..task import Task
 from .objective import Objective
 from .sides import Split, divide
 

@@ -13,8 +13,9 @@ from fathom.bench.cli import app
 from fathom.bench.drawing import PALETTE, looks_of, save
 from fathom.bench.experiment import Experiment, ExperimentError
 from fathom.bench.paired import Comparison
+from fathom.bench.task import Task
 from fathom.bench.variants import changed, named_axes, points
-from fathom.bench.working import Bench, Task
+from fathom.bench.working import Bench
 from fathom.datasets import Log
 from typer.testing import CliRunner
 

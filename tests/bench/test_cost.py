@@ -11,9 +11,10 @@ import pytest
 from fathom.bench.cli import app
 from fathom.bench.experiment import Experiment
 from fathom.bench.store import COLUMNS
+from fathom.bench.task import Task
 from fathom.bench.timing.cost import BEGIN, END, LAGS_S, cost_markdown, cost_records, draw_accuracy_cost, write_cost
 from fathom.bench.timing.cost import COLUMNS as HEADINGS
-from fathom.bench.working import Bench, Task
+from fathom.bench.working import Bench
 from fathom.estimators import ESTIMATORS
 from typer.testing import CliRunner
 

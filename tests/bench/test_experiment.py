@@ -314,7 +314,7 @@ ORPHANED = """
 import sys, time
 from fathom.bench.experiment import Experiment
 from fathom.bench.workers import Worker
-from fathom.bench.working import Task
+from fathom.bench.task import Task
 
 log = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
 estimator = {"name": "mishap", "with": {"kind": "hangs"}}

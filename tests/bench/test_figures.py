@@ -19,8 +19,9 @@ from fathom.bench.step_time_figure import draw_step_times
 from fathom.bench.store import COLUMNS
 from fathom.bench.summary import records, summarise
 from fathom.bench.table import print_table, write_consistency, write_table
+from fathom.bench.task import Task
 from fathom.bench.track_figure import draw_errors, draw_tracks, load_trajectory, pages_of, tracks_of
-from fathom.bench.working import Bench, Task
+from fathom.bench.working import Bench
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure

@@ -188,7 +188,7 @@ from contextlib import closing
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
-from fathom.bench import runner, workers, working
+from fathom.bench import runner, task, workers, working
 from fathom.bench.experiment import Experiment
 
 plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
@@ -207,7 +207,7 @@ class Forked:
 
 workers.start = Forked
 for run in plan.runs()[:2]:
-    working.Bench().execute(working.Task.of(plan, run))
+    working.Bench().execute(task.Task.of(plan, run))
 
 
 def held():

@@ -17,7 +17,8 @@ from fathom.bench.run import run_log
 from fathom.bench.store import COLUMNS
 from fathom.bench.summary import summarise
 from fathom.bench.table import print_table
-from fathom.bench.working import Bench, Task
+from fathom.bench.task import Task
+from fathom.bench.working import Bench
 from fathom.datasets.scenario import Scenario
 from fathom.datasets.simulator import simulate
 from fathom.estimators import create

@@ -18,7 +18,8 @@ from fathom.bench.floor import floors
 from fathom.bench.reproduce import compare, rebuild, reproduce_all
 from fathom.bench.runner import run_experiment
 from fathom.bench.stored import choose
-from fathom.bench.working import Bench, Finished, Task
+from fathom.bench.task import Finished, Task
+from fathom.bench.working import Bench
 from fathom.datasets.folder import write_folder
 from fathom.datasets.scenario import Scenario
 from fathom.datasets.simulator import simulate

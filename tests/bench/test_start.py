@@ -16,7 +16,8 @@ from fathom.bench.run import run_log
 from fathom.bench.store import COLUMNS, Store
 from fathom.bench.summary import summarise
 from fathom.bench.table import write_table
-from fathom.bench.working import Bench, Task
+from fathom.bench.task import Task
+from fathom.bench.working import Bench
 from fathom.datasets import Log, Scenario, simulate
 from fathom.estimators import create
 

@@ -15,12 +15,12 @@ import pytest
 import yaml
 from fathom.bench.cli import app
 from fathom.bench.experiment import Experiment, ExperimentError, Sides
+from fathom.bench.task import Finished
 from fathom.bench.tuning import search as tuning_search
 from fathom.bench.tuning.objective import DUE, SCORES, Marks, Objective
 from fathom.bench.tuning.outcome import Outcome, judge, write_outcome
 from fathom.bench.tuning.search import Trial, searching
 from fathom.bench.tuning.tuning import Tuning, prepare
-from fathom.bench.working import Finished
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.errors import DatasetError
 from fathom.datasets.folder import write_folder
