@@ -119,7 +119,7 @@ class Objective:
             of_v, of_b = self.loss(v, n_v, axis), self.loss(b, n_b, axis)
             return of_b - of_v if self.is_distance else np.log(of_b / of_v)
 
-        data = (*tuned, *sheet)
+        data = (tuned.values, tuned.weights, sheet.values, sheet.weights)
         return float(less(*data)), bootstrap_interval(data, less, "BCa", 0, **BOOTSTRAP) if len(
             tuned.values
         ) >= FEWEST_SEEDS else None
