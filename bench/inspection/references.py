@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -75,13 +75,13 @@ def reference_of(log: Log) -> Reference | None:
     return Reference(t_s, truth.p_WB_W, v_W, truth.R_WB)
 
 
-def _at_sensor(log: Log, reference: Reference, t_ns: TimeArray, p_BS_B: Sequence[float]) -> tuple[Array, Mask, Array]:
+def _at_sensor(log: Log, reference: Reference, t_ns: TimeArray, p_BS_B: Array) -> tuple[Array, Mask, Array]:
     """Return of a sensor's times those that the reference covers, which they are, and where it was then (n, 3) m."""
     t_s = seconds(log, t_ns)
     inside = reference.covers(t_s)
     t_s = t_s[inside]
     R_WB = np.nan_to_num(reference.at(t_s, reference.R_WB))
-    return t_s, inside, reference.at(t_s, reference.p_W) + R_WB @ np.asarray(p_BS_B)
+    return t_s, inside, reference.at(t_s, reference.p_W) + R_WB @ p_BS_B
 
 
 def truth_against_itself(log: Log) -> Answer | None:

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ..floor_ratio import OVER
+from ..intervals import interval_over_seeds
 from ..metrics import BLOCKS
+from ..paired import FEWEST_SEEDS
 from ..run import INNOVATIONS
 from ..summary import MEDIAN, OUTLIERS, Record, groups
 from ..table import (
@@ -29,7 +31,6 @@ from ..table import (
     score_name,
     who,
 )
-from .intervals import FEWEST_SEEDS, interval_over_seeds
 
 Value = float | int | str | None
 Done = Mapping[tuple[Any, ...], Sequence[Record]]

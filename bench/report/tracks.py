@@ -13,8 +13,8 @@ from pyarrow.parquet import read_metadata
 
 from ...datasets.errors import one_line
 from ...datasets.state import POSITION, Array
-from ..figures import Track, tracks_of
 from ..summary import Record, groups
+from ..track_figure import Track, tracks_of
 from .sheets import lookahead
 
 POSES = 200_000

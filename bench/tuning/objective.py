@@ -120,9 +120,8 @@ class Objective:
             return of_b - of_v if self.is_distance else np.log(of_b / of_v)
 
         data = (tuned.values, tuned.weights, sheet.values, sheet.weights)
-        return float(less(*data)), bootstrap_interval(data, less, "BCa", 0, **BOOTSTRAP) if len(
-            tuned.values
-        ) >= FEWEST_SEEDS else None
+        enough = len(tuned.values) >= FEWEST_SEEDS
+        return float(less(*data)), bootstrap_interval(data, less, "BCa", 0, **BOOTSTRAP) if enough else None
 
     def gain_of(self, tuned: float, sheet: float) -> float:
         """Return the gain between two losses."""

@@ -18,13 +18,13 @@ import pandas as pd
 import pytest
 from fathom.bench import cli
 from fathom.bench.experiment import Experiment
-from fathom.bench.figures import load_trajectory
-from fathom.bench.report.intervals import interval_over_seeds
+from fathom.bench.intervals import interval_over_seeds
 from fathom.bench.report.page import ordinal, render
 from fathom.bench.report.results import differences_of, in_order, kept_plan
 from fathom.bench.report.runs import spans
 from fathom.bench.store import load_runs
 from fathom.bench.table import SHOWN, print_table
+from fathom.bench.track_figure import load_trajectory
 from rich.console import Console
 from typer.testing import CliRunner
 
