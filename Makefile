@@ -12,7 +12,7 @@ bench: .venv/core
 	$(BIN)/fathom run filter_vs_smoother $(if $(DATA),--data $(DATA))
 
 test: .venv/dev lint
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations 40
 
 timing: .venv/dev
 	$(BIN)/fathom timing
