@@ -157,6 +157,7 @@ def assert_same(rows: pd.DataFrame, others: pd.DataFrame) -> None:
     pd.testing.assert_frame_equal(rows[names], others[names], check_exact=True)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_costs_a_retry_and_the_rows_are_those_of_a_local_run(
     client: Client, scheduler: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,6 +189,7 @@ def test_a_worker_that_is_killed_costs_a_retry_and_the_rows_are_those_of_a_local
     assert run_experiment(plan, out=tmp_path / "cluster", jobs=1).attrs["standing"] == 8  # one ledger for both
 
 
+@pytest.mark.slow
 def test_a_run_that_takes_its_workers_along_is_a_failed_row_and_the_rest_is_done(
     client: Client, scheduler: str, tmp_path: Path
 ) -> None:
