@@ -285,8 +285,8 @@ SAME_BLOCK = (
 )
 
 FROM_CPP = (
-    "GTSAM calls Python with its values and a list of Jacobians; fetching poses from it and handing arrays back costs "
-    "more than the native factor before our compiled lines begin"
+    "a Python factor that fetches nothing and returns constants takes 3.5 times the native one already, and 4.4 times "
+    "where it fetches the two poses, before our compiled lines begin"
 )
 
 BUDGETS: Sequence[Budget] = (
