@@ -7,17 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ..datasets.recording import Recording
     from ..datasets.scenario import Scenario
     from ..datasets.trajectory import Trajectory
-    from .experiment import Experiment
 
 app = typer.Typer(
     help="Filter or smoother? A benchmark for underwater navigation.",
@@ -94,6 +91,7 @@ def run(
     """
     with refusing_bad_input():
         from .experiment import Experiment
+        from .presenting import present
         from .runner import run_experiment
 
         plan = Experiment.load(experiment)
@@ -103,67 +101,12 @@ def run(
         except KeyboardInterrupt:
             _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}; the same command does the rest")
             raise typer.Exit(INTERRUPTED) from None
-        _present(rows, plan, folder)
+        present(rows, plan, folder)
     statuses = set(rows.loc[~rows["log"].isin(rows.attrs["kept"]), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)
     if statuses - {"done", "absent"}:
         raise typer.Exit(SOME_FAILED)
-
-
-def _present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
-    """Write the CSV files and the figures of all that was run of this plan, and print the tables of these rows."""
-    from .experiment import ExperimentError
-    from .figures import draw_figures
-    from .latex import write_latex
-    from .paired import paired
-    from .runner import outdated, rows_of
-    from .store import load_runs
-    from .table import print_table, write_consistency, write_paired, write_table
-
-    every = rows_of(load_runs(folder), plan.runs())
-    others = every.loc[~every["identity"].isin(rows["identity"])]
-    old = others.index[outdated(others, plan)]
-    every = every.drop(old)
-    differences = paired(every, plan.comparisons(), plan.compare)
-    try:
-        write_table(every, folder / "table.csv")
-        write_latex(every, folder / "table.tex")
-        write_consistency(every, folder / "consistency.csv")
-        write_paired(differences, folder / "paired.csv")
-        figures = draw_figures(every, folder, differences)
-    except OSError as error:
-        raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
-    _say(f"{folder}: runs.sqlite, table.csv, table.tex, consistency.csv, paired.csv, {len(figures)} figures")
-    _write_report(every, plan, folder, differences)
-    shown = set(zip(rows["log"], rows["label"], strict=True))
-    print_table(rows, differences=[row for row in differences if (row["log"], row["label"]) in shown])
-    standing, renewed = rows.attrs["standing"], rows.attrs["renewed"]
-    if standing:
-        _say(f"{standing} runs were done already; --force does them again")
-    if renewed:
-        _say(f"{renewed} runs were done under another spec, log or version, and made anew")
-    if len(old):
-        _say(f"{len(old)} rows of another spec or version are left out of the files; without --only they are renewed")
-    for log, cause in rows.attrs["kept"].items():
-        _say(f"{log}: {cause}; its rows are from an earlier run")
-
-
-def _write_report(rows: pd.DataFrame, plan: Experiment, folder: Path, differences: list[dict[str, Any]]) -> None:
-    """Write report.html, or say how to get it; what was asked goes beside it."""
-    from rich.console import Console
-
-    from .report.page import NoExtraError, write_report
-    from .report.results import keep_plan
-
-    keep_plan(plan, folder)
-    try:
-        with Console(stderr=True).status("writing report.html"):
-            file = write_report(rows, folder, differences)
-    except NoExtraError as missing:
-        _say(f"no report.html: {missing}")
-    else:
-        _say(f"{file}: tables, figures and every run, for a browser")
 
 
 @app.command()

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fathom.bench import cli
+from fathom.bench import cli, presenting
 from fathom.bench.experiment import Experiment
 from fathom.bench.intervals import interval_over_seeds
 from fathom.bench.report.page import ordinal, render
@@ -482,7 +482,7 @@ def test_without_the_extra_report_is_refused_and_run_says_how_to_get_it(
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "pip install 'fathom-bench[report]'" in err
     plan = Experiment.load(folder / "experiment.yaml")
-    cli._write_report(rows, plan, tmp_path, [])
+    presenting._write_report(rows, plan, tmp_path, [])
     said = capsys.readouterr().err
     assert "no report.html: " in said
     assert "pip install 'fathom-bench[report]'" in said
