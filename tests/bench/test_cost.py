@@ -130,3 +130,14 @@ def test_what_cannot_be_profiled_or_written_is_refused_in_one_line(
     assert result.exit_code == 2
     assert said in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not tell peaks of memory")
+def test_a_run_does_not_hide_in_the_memory_that_the_run_before_left() -> None:
+    plan = Experiment.from_dict(
+        {"name": "m", "logs": [{"scenario": {"duration_s": 60}}], "estimators": [{"name": "isam2"}], "seeds": [1]}
+    )
+    bench, task = Bench(), Task.of(plan, plan.runs()[0])
+    first, again = (bench.execute(task).rows[0]["peak_mb"] for _ in range(2))
+    assert first > 5  # a graph of 300 keyframes with 15 × 15 blocks
+    assert again > 0.5 * first
