@@ -366,7 +366,7 @@ def test_the_figure_is_vectors_and_a_legible_png(differences: list[dict[str, Any
 def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench()
     monkeypatch.setattr("fathom.bench.runner.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks))
-    monkeypatch.setattr("fathom.bench.figures.draw_figures", lambda rows, folder, differences: [])
+    monkeypatch.setattr("fathom.bench.presenting.draw_figures", lambda rows, folder, differences: [])
     only = ["run", str(folder.parent / "small.yaml"), "--out", str(folder.parent), "--only", "l heard/eskf no gps"]
     result = CliRunner().invoke(app, only)
     assert result.exit_code == 0, result.output

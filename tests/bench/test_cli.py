@@ -141,7 +141,7 @@ def test_a_table_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fathom.bench.table.write_table", full)
+    monkeypatch.setattr("fathom.bench.presenting.write_table", full)
     code, _, err = call("run", write(tmp_path), "--out", tmp_path, "--jobs", 1, "--only", "dead*")
     assert code == 2
     assert "No space left on device" in err
