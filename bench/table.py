@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from . import terminal
 from .floor_ratio import OVER
 from .intervals import summarise_with_intervals
 from .metrics import BLOCKS
@@ -69,10 +70,7 @@ def print_table(rows: pd.DataFrame, console: Console | None = None, differences:
     enough for ANEES; late readings and outliers where there were any; then the `differences` that `paired` found, a
     table per baseline.
     """
-    if console is None:
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=120)
+    console = console or terminal.console()
     every = summarise(rows)
     for summary in groups(every, "log").values():
         for table in (_accuracy(summary), _floor(summary), _honesty(summary), _late_or_out(summary)):

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from ..store import provenance
+from ..terminal import console
 from .revision import TimingError
 
 Named = TypeVar("Named")
@@ -193,12 +194,6 @@ def progress() -> Iterator[Any]:
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task("", total=1.0)
         yield lambda what, share: bar.update(task, description=what, completed=share)
-
-
-def console() -> Console:
-    """Return the terminal, or 120 columns where there is none."""
-    terminal = Console()
-    return terminal if terminal.is_terminal else Console(width=120)
 
 
 def _figures(value: float | None) -> str:

@@ -12,6 +12,7 @@ from ...datasets.log import Log
 from ...datasets.scenario import Scenario
 from ...datasets.simulator import simulate
 from ...estimators.registry import ESTIMATORS, create, package_of
+from .. import terminal
 from ..drawing import looks_of, save
 from ..experiment import Experiment, ExperimentError
 from ..runner import run_experiment
@@ -62,8 +63,7 @@ def print_profile(names: Sequence[str], folder: Path | None) -> bool:
     files += save(draw_by_lag(lags, looks, f"{title}: steps against lag"), folder / "step-against-lag")
     files += save(draw_over_log(courses, looks, f"{log.name}: steps against time in the log"), folder / "step-over-log")
 
-    out = Console()
-    out = out if out.is_terminal else Console(width=120)
+    out = terminal.console()
     out.print(profile_table(profiles))
     out.print(ABOUT)
     out.print(f"{title}; of each step the quickest of {REPEATS} repeats; µs without probes, shares with them")

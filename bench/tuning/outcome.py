@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from .. import terminal
 from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..experiment import ExperimentError
 from ..paired import FEWEST_SEEDS
@@ -213,10 +214,7 @@ def draw_search(outcome: Outcome) -> Figure:
 
 def print_outcome(outcome: Outcome, console: Console | None = None) -> None:
     """Print the scores, the factors with how sharp each is, what speaks against them, and the YAML to paste."""
-    if console is None:
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=120)
+    console = console or terminal.console()
     tuning = outcome.tuning
     runs = (len(tuning.split.train), len(outcome.held_out[0].values) if outcome.held_out else 0)
     headings = [f"{side}, {n} {'run' if n == 1 else 'runs'}" for side, n in zip(SIDES, runs, strict=True)]
