@@ -19,7 +19,7 @@ timing: .venv/dev
 
 # results/reference/*.csv anew; recorded logs among them where FATHOM_DATA has them
 reference: .venv/core
-	$(if $(DATA),FATHOM_DATA=$(DATA)) $(BIN)/python -m fathom.bench.reference
+	$(if $(DATA),FATHOM_DATA=$(DATA)) $(BIN)/python -m fathom.bench.execution.reference
 
 # basedpyright cannot follow an editable install, so it sees a plain one
 lint: .venv/dev

@@ -6,23 +6,26 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .experiment import Experiment, ExperimentError
+    from .errors import ExperimentError
+    from .execution.drive import run_log, warm_up
+    from .execution.result import Result
+    from .execution.sweep import run_experiment
+    from .experiment.plan import Experiment
     from .metrics import ate, nees, rpe
-    from .run import Result, Scoring, run_log, scores, warm_up
-    from .runner import run_experiment
+    from .metrics.scoring import Scoring, scores
 
 HOME = {
-    "Experiment": "experiment",
-    "ExperimentError": "experiment",
-    "Result": "run",
-    "Scoring": "run",
+    "Experiment": "experiment.plan",
+    "ExperimentError": "errors",
+    "Result": "execution.result",
+    "Scoring": "metrics.scoring",
     "ate": "metrics",
     "nees": "metrics",
     "rpe": "metrics",
-    "run_experiment": "runner",
-    "run_log": "run",
-    "scores": "run",
-    "warm_up": "run",
+    "run_experiment": "execution.sweep",
+    "run_log": "execution.drive",
+    "scores": "metrics.scoring",
+    "warm_up": "execution.drive",
 }
 """Which module each public name lives in; so `fathom --help` does not wait for numba."""
 

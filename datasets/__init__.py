@@ -12,18 +12,16 @@ from .state import Belief, NavState
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from .initialise import initialise
-    from .opening import RecordingNotFound, catalog_names, open_log
-    from .scenario import Scenario
-    from .simulator import simulate
+    from .described.opening import RecordingNotFound, catalog_names, open_log
+    from .simulated.scenario import Scenario
+    from .simulated.simulator import simulate
 
 _LATER = {
-    "Scenario": "scenario",
-    "simulate": "simulator",
-    "open_log": "opening",
-    "catalog_names": "opening",
-    "RecordingNotFound": "opening",
-    "initialise": "initialise",
+    "Scenario": "simulated.scenario",
+    "simulate": "simulated.simulator",
+    "open_log": "described.opening",
+    "catalog_names": "described.opening",
+    "RecordingNotFound": "described.opening",
 }
 """Names whose modules bring pydantic, pandas or splines along: imported when first asked for."""
 
@@ -39,7 +37,6 @@ __all__ = [
     "Scenario",
     "Trajectory",
     "catalog_names",
-    "initialise",
     "open_log",
     "simulate",
 ]

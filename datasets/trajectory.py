@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
-from .state import LIMIT_NS, Array, Belief, NavState, TimeArray
+from .state import Array, Belief, NavState, TimeArray
+from .times import seconds_to_ns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -169,7 +170,7 @@ class Trajectory:
         Raises:
             DatasetError: a column is missing, or a time is none.
         """
-        from .columns import times_ns
+        from .times import times_ns
 
         rotation, position = [f"R_WB_{i}{j}" for i in range(3) for j in range(3)], [f"p_WB_W_{a}" for a in "xyz"]
         absent = [name for name in ("t_ns", *rotation, *position) if name not in table]
@@ -212,20 +213,3 @@ def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
     if not (all(map(math.isfinite, numbers)) and abs(length - 1) < 1e-3):
         raise ValueError(f"not a finite pose with a unit quaternion (|q| = {length:.6g})")
     return stamp_ns, numbers[1:]
-
-
-def seconds_to_ns(text: str) -> int:
-    """Convert decimal seconds, as text, to nanoseconds without passing through float64.
-
-    Raises:
-        ValueError: not a number, or one beyond LIMIT_NS.
-    """
-    from decimal import Decimal
-
-    try:
-        ns = (Decimal(text) * 1_000_000_000).to_integral_value()
-        if abs(ns) < LIMIT_NS:
-            return int(ns)
-    except ArithmeticError:  # decimal's errors are of this kind
-        pass
-    raise ValueError(f"not a time in seconds: {text[:40]!r}; nanoseconds?")

@@ -1,8 +1,8 @@
 """The measurement physics, once; then one module per estimator."""
 
-from .compiled_cache import forget_stale_code
+from .compiled_cache import use_compiled_folder
 
-forget_stale_code()  # before anything is compiled or loaded
+use_compiled_folder()  # before anything is compiled or loaded
 
 from .interface import FACTORS, Diverged, Estimator, Pass  # noqa: E402
 from .registry import ESTIMATORS, create  # noqa: E402

@@ -12,10 +12,10 @@ from ..datasets.epochs import ATTITUDE, DEPTH, DVL, HEADING, SENSOR, Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
-from .dvl_preintegration import preintegrate_dvl
-from .imu import compile_rig, over_world
 from .interface import FACTORS, Factors
-from .so3 import exp
+from .physics.dvl_preintegration import preintegrate_dvl
+from .physics.imu import compile_rig, over_world
+from .physics.so3 import exp
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from pydantic import ValidationError
 
 from ..datasets.errors import nearest, not_loaded
 from .dead_reckoning import DeadReckoning
-from .eskf import ErrorStateKalmanFilter
-from .eskf_filterpy import FilterpyKalmanFilter
-from .iekf import InvariantKalmanFilter
+from .filters.eskf import ErrorStateKalmanFilter
+from .filters.eskf_filterpy import FilterpyKalmanFilter
+from .filters.iekf import InvariantKalmanFilter
+from .filters.rts import RauchTungStriebelSmoother
+from .filters.ukf import UnscentedKalmanFilter
 from .interface import Estimator
-from .rts import RauchTungStriebelSmoother
 from .smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother, WindowSmoother
-from .ukf import UnscentedKalmanFilter
 
 ESTIMATORS: dict[str, Any] = {
     "dead-reckoning": DeadReckoning,

@@ -11,10 +11,10 @@ from pydantic.dataclasses import dataclass
 
 from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief
-from .graph_pass import GraphSmoother, GtsamSmoother, NonNegative, Positive
+from .graph.graph_pass import GraphSmoother, GtsamSmoother, NonNegative, Positive
+from .graph.solvers import BatchLagSolver, BatchSolver, IncrementalSolver, Solver, isam2_params
 from .interface import Pass
-from .solvers import BatchLagSolver, BatchSolver, IncrementalSolver, Solver, isam2_params
-from .window import Solving, WindowPass
+from .window.window_pass import Solving, WindowPass
 
 
 @dataclass(frozen=True)

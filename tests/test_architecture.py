@@ -1,19 +1,26 @@
-"""The tree is the architecture: imports point downwards, and `fathom --help` waits for nothing heavy."""
+"""The tree is the architecture: rooms, floors, downward imports; and `fathom --help` loads nothing heavy."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LEVEL = {"datasets": 0, "estimators": 1, "bench": 2}
-TYPES_OF_A_LOG = {"epochs", "errors", "log", "rig", "state", "trajectory"}
+TYPES_OF_A_LOG = {"epochs", "errors", "log", "rig", "state", "trajectory", "quantities"}
 HEAVY = {"matplotlib", "pandas", "gtsam", "numba", "numpy", "scipy", "pyarrow"}
 SOURCES = [path for folder in LEVEL for path in sorted((ROOT / folder).rglob("*.py"))]
-SOURCES = [path for path in SOURCES if "__pycache__" not in path.parts]  # a profile's wrappers lie there
+SOURCES = [path for path in SOURCES if "__pycache__" not in path.parts]
+FOLDERS = sorted({path.parent for path in SOURCES})
+MOST_MODULES = 16
+"""In one folder; more cannot be taken in at a glance."""
+MOST_FLOORS = 10
+FRONTS = {"estimators.registry"}
+"""Modules that gather a folder and those below it, as `__init__` does: a floor of their own, above both."""
 
 
 def imports(path: Path) -> Iterator[tuple[str, ...]]:
@@ -26,6 +33,44 @@ def imports(path: Path) -> Iterator[tuple[str, ...]]:
             base = here[: len(here) - node.level + 1] if node.level else ()
             module = (*base, *(node.module.split(".") if node.module else ()))
             yield from ((*module, alias.name) for alias in node.names)
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path): path for path in SOURCES}
+
+
+def modules_of_ours(path: Path) -> set[str]:
+    """The modules of ours that a file imports, at its top or later."""
+    named = {".".join(parts[1:]) for parts in imports(path) if parts[0] == "fathom"}
+    return {name if name in MODULES else name.rpartition(".")[0] for name in named} & MODULES.keys() - {name_of(path)}
+
+
+def room_of(module: str) -> str:
+    """The folder that a module stands in; a folder's front is a room of its own."""
+    path = MODULES[module]
+    folder = ".".join(path.relative_to(ROOT).parts[:-1])
+    return f"{folder} (front)" if path.name == "__init__.py" or module in FRONTS else folder
+
+
+def rooms() -> dict[str, set[str]]:
+    """Which rooms each room imports."""
+    graph: dict[str, set[str]] = {}
+    for module, path in MODULES.items():
+        found = {room_of(other) for other in modules_of_ours(path)}
+        graph.setdefault(room_of(module), set()).update(found - {room_of(module)})
+    return graph
+
+
+def floors(graph: Mapping[str, Iterable[str]]) -> dict[str, int]:
+    """How high each node stands: one above the highest that it imports."""
+    height: dict[str, int] = {}
+    for node in TopologicalSorter(graph).static_order():
+        height[node] = 1 + max((height[other] for other in graph.get(node, ())), default=0)
+    return height
 
 
 def of_ours(path: Path) -> set[tuple[str, str]]:
@@ -41,20 +86,45 @@ def test_imports_point_downwards_and_relatively(path: Path) -> None:
     assert not [node.module for node in absolute if (node.module or "").split(".")[0] == "fathom"]
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "estimators").glob("*.py")), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", sorted((ROOT / "estimators").rglob("*.py")), ids=lambda path: path.name)
 def test_estimators_know_only_the_types_of_a_log(path: Path) -> None:
     assert {module for package, module in of_ours(path) if package == "datasets"} <= TYPES_OF_A_LOG
 
 
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    floors({module: modules_of_ours(path) for module, path in MODULES.items()})
+
+
+def test_rooms_stand_on_few_floors_without_a_circle() -> None:
+    height = floors(rooms())
+    assert max(height.values()) <= MOST_FLOORS, height
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_folder_holds_more_than_can_be_taken_in(folder: Path) -> None:
+    assert len(list(folder.glob("*.py"))) <= MOST_MODULES
+
+
+def test_gtsam_is_imported_in_one_folder_only() -> None:
+    having = {room_of(name) for name, path in MODULES.items() if any(parts[0] == "gtsam" for parts in imports(path))}
+    assert having == {"estimators.graph"}
+
+
 def test_the_walk_sees_relative_imports() -> None:
-    assert ("datasets", "trajectory") in of_ours(ROOT / "bench" / "run.py")
-    assert ("bench", "metrics") in of_ours(ROOT / "bench" / "run.py")
+    assert "datasets.trajectory" in modules_of_ours(ROOT / "bench" / "execution" / "drive.py")
+    assert "bench.metrics.scoring" in modules_of_ours(ROOT / "bench" / "execution" / "worker.py")
+
+
+def test_the_walk_sees_a_circle() -> None:
+    with pytest.raises(CycleError):
+        floors({"a": {"b"}, "b": {"c"}, "c": {"a"}})
 
 
 def test_the_command_line_imports_nothing_heavy_at_its_top() -> None:
-    tree = ast.parse((ROOT / "bench" / "cli.py").read_text())
-    top = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
-    named = {alias.name for node in top for alias in node.names if isinstance(node, ast.Import)}
-    named |= {node.module or "" for node in top if isinstance(node, ast.ImportFrom)}
-    assert not {name.split(".")[0] for name in named} & HEAVY
-    assert not [node for node in top if isinstance(node, ast.ImportFrom) and node.level]
+    for path in sorted((ROOT / "bench" / "cli").glob("*.py")):
+        tree = ast.parse(path.read_text())
+        top = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+        named = {alias.name for node in top for alias in node.names if isinstance(node, ast.Import)}
+        named |= {node.module or "" for node in top if isinstance(node, ast.ImportFrom) and not node.level}
+        assert not {name.split(".")[0] for name in named} & HEAVY
+        assert not [node for node in top if isinstance(node, ast.ImportFrom) and node.level > 1]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import yaml
-from fathom.bench.experiment import Experiment
-from fathom.datasets.description import check_description
+from fathom.bench.experiment.plan import Experiment
+from fathom.datasets.described.description import check_description
 from fathom.datasets.errors import DatasetError
-from fathom.datasets.scenario import Scenario
+from fathom.datasets.simulated.scenario import Scenario
 
 ROOT = Path(__file__).resolve().parents[1]
 NEEDS_ITS_PACKAGE = "your-own-estimator.md"

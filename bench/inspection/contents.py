@@ -8,7 +8,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from ...datasets.recording import Held
+from ...datasets.formats.recording import Held
 
 
 def print_contents(held: Sequence[Held], console: Console) -> None:

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from ...datasets.described.opening import RecordingNotFound, open_log
 from ...datasets.errors import DatasetError
 from ...datasets.log import Log
-from ...datasets.opening import RecordingNotFound, open_log
-from .findings import Check, Finding
-from .imu_noise import check_imu_noise
-from .noise import check_noise
-from .norms import check_norms
-from .outliers import check_outliers
-from .rates import check_delays, check_rates
-from .static import check_static
-from .values import check_values
+from .findings.finding import Check, Finding
+from .streams.imu_noise import check_imu_noise
+from .streams.noise import check_noise
+from .streams.norms import check_norms
+from .streams.outliers import check_outliers
+from .streams.rates import check_delays, check_rates
+from .streams.static import check_static
+from .streams.values import check_values
 
 SINGLE = (
     check_rates,
@@ -98,7 +98,7 @@ def _check_sizes(name: str | Path, log: Log) -> None:
 
 def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Inspection:
     """Put every check to a log; `repairs` are the notes of what opening it has had to drop."""
-    from .cross import cross_checks
+    from .between.cross import cross_checks
 
     checks = [check(log) for check in SINGLE]
     return Inspection(log, (_check_repairs(log, repairs), *checks, *cross_checks(log)))

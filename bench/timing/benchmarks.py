@@ -1,7 +1,7 @@
 """What is timed: small pieces of real work, by name and group.
 
-`pytest tests/timing` times these, `fathom timing --against REV` compares them with those of another revision. There
-this very file is loaded into both revisions' packages, so that both do the same work. It therefore asks them for what
+`pytest tests/bench/timing` times these, `fathom timing --against REV` compares them with those of another revision.
+There this file is loaded into the packages of both revisions, so both do the same work. It therefore asks them for what
 others rely on (DESIGN, section 10) wherever it can, and for anything only inside of a benchmark: a revision that lacks
 it lacks that benchmark alone. Logs and stores are written once, by `write_inputs`, and read by both.
 """
@@ -75,9 +75,9 @@ ROWS = {
 def write_inputs(folder: Path, chosen: Iterable[Benchmark]) -> None:
     """Write the logs, the track and, for the report, the store of runs that these benchmarks read."""
     from ...datasets import Scenario, simulate
-    from ...datasets.folder import write_folder
-    from ..experiment import Experiment
-    from ..runner import run_experiment
+    from ...datasets.described.folder import write_folder
+    from ..execution.sweep import run_experiment
+    from ..experiment.plan import Experiment
 
     for name, scenario in SCENARIOS.items():
         log = simulate(Scenario.from_dict(scenario), seed=4)
@@ -130,7 +130,7 @@ def _steps(
     """Begin a pass, take every step of a log, or of its first seconds, and finish."""
     from ...datasets.epochs import cut
     from ...estimators import create
-    from ..run import score_ticks
+    from ..execution.drive import score_ticks
 
     log = _log(folder, log_name)
     estimator = create(name, **options)
@@ -166,7 +166,7 @@ def _imu_blocks(folder: Path) -> Work:
 
     from ...datasets.epochs import cut
     from ...estimators import FACTORS
-    from ...estimators.imu import BLOCK, compile_rig, first_sample, integrate
+    from ...estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate
 
     log = _log(folder, "minute")
     rig, samples = compile_rig(log.rig, FACTORS, {}), cut(log, log.imu.t_ns[-1:], ()).epochs[0].imu
@@ -187,8 +187,8 @@ def _displacements(folder: Path) -> Work:
 
     from ...datasets.epochs import cut
     from ...estimators import FACTORS
-    from ...estimators.dvl_preintegration import preintegrate_dvl
-    from ...estimators.imu import compile_rig
+    from ...estimators.physics.dvl_preintegration import preintegrate_dvl
+    from ...estimators.physics.imu import compile_rig
 
     log = _log(folder, "minute")
     rig, samples = compile_rig(log.rig, FACTORS, {}), cut(log, log.imu.t_ns[-1:], ()).epochs[0].imu
@@ -236,7 +236,8 @@ def _tum(folder: Path) -> Work:
 
 def _harness(folder: Path) -> Work:
     from ...estimators import create
-    from ..run import run_log, scores
+    from ..execution.drive import run_log
+    from ..metrics.scoring import scores
 
     log, estimator = _log(folder, "minute"), create("dead-reckoning", attitude="heading")
 
@@ -251,15 +252,15 @@ def _harness(folder: Path) -> Work:
 def _tables(folder: Path) -> Work:
     from rich.console import Console
 
-    from ..store import load_runs
-    from ..table import print_table
+    from ..output.tables.table import print_table
+    from ..results.store import load_runs
 
     rows = load_runs(folder / "rows")
     return Work(lambda: print_table(rows, Console(file=io.StringIO(), width=120)), len(rows))
 
 
 def _reading_rows(folder: Path) -> Work:
-    from ..store import load_runs
+    from ..results.store import load_runs
 
     return Work(lambda: [load_runs(folder / "rows") for _ in range(5)], 5 * len(load_runs(folder / "rows")))
 

@@ -19,14 +19,16 @@ from typing import Any
 import numpy as np
 
 from ...datasets import Log, Scenario, simulate
+from ...datasets.described.folder import write_folder
 from ...datasets.epochs import cut
-from ...datasets.folder import write_folder
 from ...estimators import create
-from ..experiment import Experiment
+from ..execution.drive import run_log, score_ticks, warm_up
+from ..execution.pool import run_all
+from ..execution.result import Result
+from ..execution.task import Task
+from ..experiment.plan import Experiment
 from ..metrics import ate
-from ..run import Result, run_log, score_ticks, scores, warm_up
-from ..task import Task
-from ..workers import run_all
+from ..metrics.scoring import scores
 from . import evo
 
 LAGS_S = (3.0, 10.0, 30.0)
@@ -123,7 +125,7 @@ def python_factor() -> Measured:
     import gtsam
     from gtsam.symbol_shorthand import L, X
 
-    from ...estimators.gtsam_border import displacement_factor, insert_state
+    from ...estimators.graph.gtsam_border import displacement_factor, insert_state
 
     log = _simulated(60.0)
     assert log.prior is not None
@@ -264,7 +266,7 @@ def help_against_numpy() -> Measured:
         after = os.times()
         return after.children_user + after.children_system - before.children_user - before.children_system
 
-    ask, load = partial(seconds, "-m", "fathom.bench.cli", "--help"), partial(seconds, "-c", "import numpy")
+    ask, load = partial(seconds, "-m", "fathom.bench.cli.app", "--help"), partial(seconds, "-c", "import numpy")
     ask()
     load()
     return Measured(tuple(min(ask(), ask()) / min(load(), load()) for _ in range(5)))

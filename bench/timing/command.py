@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from ..store import provenance
-from ..terminal import console
+from ..output.tables.terminal import console
+from ..results.store import provenance
 from .revision import TimingError
 
 Named = TypeVar("Named")

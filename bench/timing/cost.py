@@ -13,9 +13,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
 from ..metrics import pooled_rmse
-from ..summary import Record, groups, records
+from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
+from ..results.summary import Record, groups, records
 from .machine import machine_text
 
 EXPERIMENT = "cost"

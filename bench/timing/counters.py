@@ -17,7 +17,7 @@ from numba.core.runtime import _nrt_python as numba_memory  # pyright: ignore[re
 from ...datasets import Log, Scenario, simulate
 from ...datasets.epochs import Epoch, cut
 from ...estimators import create
-from ..run import score_ticks
+from ..execution.drive import score_ticks
 
 COUNTED: dict[str, tuple[str, dict[str, Any]]] = {
     "eskf": ("eskf", {}),

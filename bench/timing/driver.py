@@ -220,7 +220,7 @@ class WatchedPass:
 
 
 def _run(log: Log, estimator: Estimator, probed: bool) -> Timed | EstimatorError:
-    from ..run import cut, run_log, score_ticks
+    from ..execution.drive import cut, run_log, score_ticks
 
     passes: list[WatchedPass] = []
     watched: Any = Watched(estimator, passes) if probed else estimator
@@ -257,7 +257,7 @@ def serve(probed: bool) -> None:
 
     from numba.core import event
 
-    from ..run import warm_up
+    from ..execution.drive import warm_up
 
     class Tell(event.Listener):
         def on_start(self, event: Any) -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ...datasets.log import Log
 from ...estimators.interface import Estimator
-from ..drawing import PALETTE, WIDTH_IN, empty_figure
+from ..output.figures.drawing import PALETTE, WIDTH_IN, empty_figure
 from .driver import PARTS as NAMES
 from .driver import Driver, Timed, quickest
 

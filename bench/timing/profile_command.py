@@ -9,14 +9,15 @@ import pandas as pd
 from rich.console import Console
 
 from ...datasets.log import Log
-from ...datasets.scenario import Scenario
-from ...datasets.simulator import simulate
+from ...datasets.simulated.scenario import Scenario
+from ...datasets.simulated.simulator import simulate
 from ...estimators.registry import ESTIMATORS, create, package_of
-from .. import terminal
-from ..drawing import looks_of, save
-from ..experiment import Experiment, ExperimentError
-from ..runner import run_experiment
-from ..store import provenance
+from ..errors import ExperimentError
+from ..execution.sweep import run_experiment
+from ..experiment.plan import Experiment
+from ..output.figures.drawing import looks_of, save
+from ..output.tables import terminal
+from ..results.store import provenance
 from .cost import EXPERIMENT, cost_markdown, write_cost
 from .machine import machine_text
 from .profile import ABOUT, REPEATS, draw_profile, profile, profile_table

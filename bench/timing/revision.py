@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Any
 
-from ..experiment import ExperimentError
+from ..errors import ExperimentError
 
 ROOT = Path(__file__).resolve().parents[2]
 PREFIX = "fathom-timing-"

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from ...datasets.log import Log
 from ...datasets.state import Array, TimeArray
 from ...estimators.interface import Estimator
-from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
+from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
 from .driver import Driver, quickest
 from .profile import Tell
 

@@ -13,11 +13,11 @@ from scipy.stats import chi2
 
 from ...datasets.errors import nearest
 from ...datasets.state import Array
-from ..experiment import ExperimentError
-from ..floor_ratio import FLOORS
-from ..paired import FEWEST_SEEDS, OVER_SEEDS, TAKE, bootstrap_interval
-from ..run import INNOVATIONS
-from ..summary import MEDIAN, POOLED
+from ..errors import ExperimentError
+from ..experiment.comparison import OVER_SEEDS
+from ..metrics.floor_ratio import FLOORS
+from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
+from ..results.paired import FEWEST_SEEDS, TAKE, bootstrap_interval
 
 DUE: dict[str, float] = (
     dict.fromkeys(INNOVATIONS, 1.0)

@@ -16,10 +16,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from .. import terminal
-from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
-from ..experiment import ExperimentError
-from ..paired import FEWEST_SEEDS
+from ..errors import ExperimentError
+from ..output.figures.drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
+from ..output.tables import terminal
+from ..results.paired import FEWEST_SEEDS
 from .objective import DUE, Marks
 from .search import Search, Trial, best_of
 from .tuning import Tuning

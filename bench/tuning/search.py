@@ -14,12 +14,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from ..experiment import ExperimentError, Run
-from ..ledger import FINAL, sole_writer
-from ..store import Row, Store
-from ..summary import groups, records
-from ..workers import run_all
-from .sides import in_words
+from ..errors import ExperimentError
+from ..execution.pool import run_all
+from ..experiment.plan import Run
+from ..results.identity import FINAL
+from ..results.store import Row, Store, sole_writer
+from ..results.summary import groups, records
+from .split import in_words
 from .tuning import Tuning
 
 BATCH = 10

@@ -11,15 +11,16 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from ...datasets.described.opening import RecordingNotFound
 from ...datasets.errors import nearest
 from ...datasets.log import Log
-from ...datasets.opening import RecordingNotFound
-from ..experiment import EstimatorSpec, Experiment, ExperimentError, Run, Sides
-from ..ledger import content_sha256
-from ..run import can_judge
-from ..task import Task
+from ..errors import ExperimentError
+from ..execution.task import Task
+from ..experiment.plan import EstimatorSpec, Experiment, Run, Sides
+from ..metrics.scoring import can_judge
+from ..results.identity import content_sha256
 from .objective import Objective
-from .sides import Split, divide
+from .split import Split, divide
 
 IMU = ("accel", "gyro")
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from fathom.bench.cli import app
-from fathom.bench.store import load_runs
+from fathom.bench.cli.app import app
+from fathom.bench.results.store import load_runs
 from fathom.datasets import Log, Scenario, Trajectory, catalog_names, open_log, simulate
-from fathom.datasets.folder import write_folder
+from fathom.datasets.described.folder import write_folder
 from typer.testing import CliRunner
 from written import WRITERS, geodetic_places, write_arrays
 from written_ardupilot import write_ardupilot

@@ -70,7 +70,7 @@ class Reader:
         return done.stdout
 
     def fathom(self, *arguments: str) -> str:
-        return self.call("-m", "fathom.bench.cli", *arguments)
+        return self.call("-m", "fathom.bench.cli.app", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_the_installed_package_joins_by_its_entry_point_with_its_options(reader:
     listed = reader.fathom("list", "estimators").splitlines()
     assert "complementary: level_s, heading_s, drift, sigma_deg, factors" in listed
     assert "complementary" not in {line.split(":")[0] for line in subprocess.run(
-        [sys.executable, "-m", "fathom.bench.cli", "list", "estimators"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "fathom.bench.cli.app", "list", "estimators"], capture_output=True, text=True, check=True
     ).stdout.splitlines()}  # fmt: skip
 
 

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fathom.bench.run import run_log
+from fathom.bench.execution.drive import run_log
 from fathom.datasets import Log
 from fathom.datasets.epochs import cut
 from fathom.datasets.log import ImuStream
-from fathom.datasets.scenario import DepthSpec, DvlSpec, Scenario
-from fathom.datasets.simulator import simulate
+from fathom.datasets.simulated.scenario import Scenario
+from fathom.datasets.simulated.simulator import simulate
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec
 from fathom.estimators import create
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fathom.datasets import Log
-from fathom.datasets.initialise import initialise
-from fathom.datasets.opening import RecordingNotFound, open_log
+from fathom.datasets.described.opening import RecordingNotFound, open_log
+from fathom.estimators.alignment.initialise import initialise
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import yaml
 from fathom.datasets import Log
-from fathom.datasets.folder import write_folder
-from fathom.datasets.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from fathom.datasets.described.folder import write_folder
+from fathom.datasets.described.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from fathom.datasets.log import ImuStream
 
 READING = "std_msgs/Header header\nfloat64[] z\nfloat64[] sigma\n"

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 from fathom.datasets import Log
-from fathom.datasets.folder import write_folder
-from fathom.datasets.imc import CRC_TABLE
+from fathom.datasets.described.folder import write_folder
+from fathom.datasets.formats.imc import CRC_TABLE
 
 MESSAGES = {
     "GpsFix": (253, {"validity": "uint16_t", "lat": "fp64_t", "lon": "fp64_t", "height": "fp64_t"}),

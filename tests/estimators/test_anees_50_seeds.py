@@ -13,11 +13,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from fathom.bench.execution.drive import run_log
 from fathom.bench.metrics import BLOCKS, associate, error_state
-from fathom.bench.run import run_log
 from fathom.datasets import Log
-from fathom.datasets.scenario import DepthSpec, DvlSpec, HeadingSpec, Scenario
-from fathom.datasets.simulator import simulate
+from fathom.datasets.simulated.scenario import Scenario
+from fathom.datasets.simulated.simulator import simulate
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, HeadingSpec
 from fathom.estimators import ESTIMATORS, create
 from scipy.stats import chi2
 

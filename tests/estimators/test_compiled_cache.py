@@ -1,19 +1,119 @@
-"""Compiled code does not outlive a change in any of the sources."""
+"""Compiled code is kept by what decides it, and by nothing else."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
-from fathom.estimators.compiled_cache import forget_stale_code
+import pytest
+from fathom.estimators import compiled_cache
+from fathom.estimators.compiled_cache import code_of, compiled_folder, key_of
+
+ROOT = Path(__file__).resolve().parents[2]
+CALL = """
+from fathom.estimators.physics.calling import caller
+print(caller(1.0), sum(caller.stats.cache_hits.values()), caller.stats.cache_path)
+"""
+CALLED = """
+from numba import njit
+
+@njit(cache=True)
+def callee(x):
+    return x + 1.0
+"""
+CALLING = """
+from numba import njit
+from .called import callee
+
+@njit(cache=True)
+def caller(x):
+    return callee(x)
+"""
 
 
-def test_a_change_in_any_source_drops_all_compiled_code(tmp_path: Path) -> None:
-    source, compiled = tmp_path / "called.py", tmp_path / "__pycache__" / "caller.f-1.py311.1.nbc"
-    source.write_text("x = 1\n")
-    forget_stale_code(tmp_path)
-    compiled.write_text("machine code")
-    forget_stale_code(tmp_path)
-    assert compiled.exists()
-    source.write_text("x = 22\n")
-    forget_stale_code(tmp_path)
-    assert not compiled.exists()
+def copy_of_the_package(folder: Path) -> Path:
+    """Return the file of a compiled function in a checkout elsewhere; the file beside it has one that calls it."""
+    for name in ("bench", "datasets", "estimators"):
+        shutil.copytree(ROOT / name, folder / "fathom" / name, ignore=shutil.ignore_patterns("__pycache__"))
+    physics = folder / "fathom" / "estimators" / "physics"
+    (physics / "calling.py").write_text(CALLING)
+    (physics / "called.py").write_text(CALLED)
+    return physics / "called.py"
+
+
+def run(folder: Path, **environment: str) -> tuple[float, int, Path, str]:
+    """Return the value, how often the cache was hit, where it lies, and what was said on stderr."""
+    done = subprocess.run(
+        [sys.executable, "-c", CALL],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(folder), "PYTHONSAFEPATH": ""} | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    value, hits, path = done.stdout.split()
+    return float(value), int(hits), Path(path), done.stderr
+
+
+def test_a_changed_callee_never_runs_as_old_machine_code(tmp_path: Path) -> None:
+    cache = str(tmp_path / "cache")
+    called = copy_of_the_package(tmp_path)
+    assert run(tmp_path, NUMBA_CACHE_DIR=cache)[:2] == (2.0, 0)
+    assert run(tmp_path, NUMBA_CACHE_DIR=cache)[:2] == (2.0, 1)
+    called.write_text(CALLED.replace("x + 1.0", "x + 9.0"))
+    assert run(tmp_path, NUMBA_CACHE_DIR=cache)[:2] == (10.0, 0)
+
+
+def test_a_second_clone_and_a_changed_comment_compile_nothing(tmp_path: Path) -> None:
+    cache = str(tmp_path / "cache")
+    copy_of_the_package(tmp_path / "first")
+    called = copy_of_the_package(tmp_path / "second")
+    called.write_text(CALLED.replace("@njit", "# a comment\n@njit"))
+    assert run(tmp_path / "first", NUMBA_CACHE_DIR=cache)[1] == 0
+    assert run(tmp_path / "second", NUMBA_CACHE_DIR=cache)[1] == 1
+
+
+def test_where_no_folder_can_be_written_a_temporary_one_is_used_and_said(tmp_path: Path) -> None:
+    copy_of_the_package(tmp_path)
+    blocked = tmp_path / "blocked"
+    blocked.write_text("a file where the folder would be")
+    value, _, path, said = run(tmp_path, NUMBA_CACHE_DIR=str(blocked))
+    assert value == 2.0
+    assert said.count("cannot be written") == 1
+    assert str(blocked) in said
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        (("x + 1", "x + 2"), False),
+        (("x + 1", "x  +  1  # one more"), True),
+        (('"""Doc."""', '"""Other."""'), True),
+        (("def f", "\n\ndef f"), True),
+        (("'label'", "'other'"), False),
+    ],
+)
+def test_code_is_what_is_left_without_comments_and_docstrings(change: tuple[str, str], same: bool) -> None:
+    source = 'def f(x):\n    """Doc."""\n    g(\'label\')\n    return x + 1\n'
+    assert (code_of(source) == code_of(source.replace(*change))) is same
+
+
+def test_the_oldest_states_of_the_sources_are_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled_cache, "KEPT", 2)
+    notes = tmp_path / "sources"
+    notes.mkdir()
+    for k in range(4):
+        folder = tmp_path / key_of([("a.py", f"x = {k}")], notes)
+        folder.mkdir()
+        os.utime(folder, (k, k))
+    compiled_cache._forget_oldest(tmp_path, notes)
+    kept = {folder.name for folder in tmp_path.iterdir()} - {"sources"}
+    assert kept == {key_of([("a.py", f"x = {k}")], notes) for k in (2, 3)}
+
+
+def test_the_folder_is_the_users_not_the_checkouts() -> None:
+    assert not compiled_folder().is_relative_to(ROOT)

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fathom.bench.execution.drive import run_log
 from fathom.bench.metrics import ate
-from fathom.bench.run import run_log
 from fathom.datasets import Log
 from fathom.datasets.log import AttitudeStream
-from fathom.datasets.scenario import DepthSpec, DvlSpec, HeadingSpec, Scenario
-from fathom.datasets.simulator import simulate
+from fathom.datasets.simulated.scenario import Scenario
+from fathom.datasets.simulated.simulator import simulate
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, HeadingSpec
 from fathom.estimators import create
 
 FAST = Scenario(

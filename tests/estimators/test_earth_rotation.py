@@ -13,24 +13,25 @@ from pathlib import Path as FilePath
 import gtsam
 import numpy as np
 import pytest
+from fathom.bench.execution.drive import run_log
 from fathom.bench.metrics import BLOCKS, associate, error_state
-from fathom.bench.run import run_log
 from fathom.datasets import Belief, Log, Mounting, NavState, Rig, open_log
 from fathom.datasets import rig as rig_module
+from fathom.datasets.described.folder import write_folder
 from fathom.datasets.epochs import DEPTH, DVL, IMU_SAMPLE, Epoch, cut
 from fathom.datasets.errors import DatasetError
-from fathom.datasets.folder import write_folder
-from fathom.datasets.imu_grades import IMU_GRADES
-from fathom.datasets.scenario import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, PriorSpec, Scenario
-from fathom.datasets.simulator import simulate
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
+from fathom.datasets.simulated.scenario import Scenario
+from fathom.datasets.simulated.simulator import simulate
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, PriorSpec
 from fathom.estimators import ESTIMATORS, FACTORS, create
-from fathom.estimators.dvl_preintegration import preintegrate_dvl
-from fathom.estimators.eskf import propagate
-from fathom.estimators.gtsam_border import insert_state, preintegrate_imu
-from fathom.estimators.iekf import from_invariant, propagate_invariant, to_invariant
-from fathom.estimators.imu import BLOCK, STATE, compile_rig, first_sample, integrate, over_world, predict
-from fathom.estimators.records import as_belief, as_record
-from fathom.estimators.so3 import exp, skew
+from fathom.estimators.filters.eskf import propagate
+from fathom.estimators.filters.iekf import from_invariant, propagate_invariant, to_invariant
+from fathom.estimators.graph.gtsam_border import insert_state, preintegrate_imu
+from fathom.estimators.physics.dvl_preintegration import preintegrate_dvl
+from fathom.estimators.physics.imu import BLOCK, STATE, compile_rig, first_sample, integrate, over_world, predict
+from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.physics.so3 import exp, skew
 from gtsam.symbol_shorthand import B, V, X
 from paths import GRAVITY, Path, random_rig, random_rotation, reading
 from scipy.spatial.transform import Rotation

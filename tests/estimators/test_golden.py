@@ -9,9 +9,10 @@ import json
 from pathlib import Path
 
 import pytest
-from fathom.bench.run import run_log, scores
-from fathom.datasets.scenario import Scenario
-from fathom.datasets.simulator import simulate
+from fathom.bench.execution.drive import run_log
+from fathom.bench.metrics.scoring import scores
+from fathom.datasets.simulated.scenario import Scenario
+from fathom.datasets.simulated.simulator import simulate
 from fathom.estimators import create
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "dive_60s.json"

@@ -10,16 +10,17 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from fathom.bench.floor import floors_along
-from fathom.bench.run import Result, innovation_dof, run_log, score_ticks
+from fathom.bench.execution.drive import run_log, score_ticks
+from fathom.bench.execution.result import Result, innovation_dof
+from fathom.bench.metrics.floor import floors_along
 from fathom.datasets import Log, Scenario, simulate
 from fathom.datasets.epochs import DVL, IMU_SAMPLE, READING, Epoch
-from fathom.datasets.initialise import initialise
 from fathom.datasets.state import VELOCITY
 from fathom.estimators import create
-from fathom.estimators.gtsam_border import carried_factor, reading_factor
-from fathom.estimators.imu import BLOCK, compile_rig
-from fathom.estimators.records import as_record
+from fathom.estimators.alignment.initialise import initialise
+from fathom.estimators.graph.gtsam_border import carried_factor, reading_factor
+from fathom.estimators.physics.imu import BLOCK, compile_rig
+from fathom.estimators.physics.records import as_record
 from fathom.estimators.robust import rows
 from scipy.stats import chi2
 

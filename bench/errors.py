@@ -1,0 +1,7 @@
+"""The one exception of this package that a caller might catch."""
+
+from __future__ import annotations
+
+
+class ExperimentError(ValueError):
+    """An experiment file cannot be used; says which file, which key, and what to write instead."""

@@ -1,0 +1,1 @@
+"""Runs: one estimator driven through one log, worker processes, sweeps, Dask, reproduction."""

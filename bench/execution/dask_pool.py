@@ -1,0 +1,280 @@
+"""The same runs on a Dask cluster: descriptions go there, rows and trajectories come back.
+
+Each worker has one task at a time, and each task one worker; so a worker's death is that task's, which another worker
+then tries. What is not under way stays here: the scheduler holds one small task per worker, however many runs there
+are.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from logging import CRITICAL
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from ..errors import ExperimentError
+from .dask_worker import Greeting, dismiss, do, greet, greeting
+from .pool import Queue
+from .task import Finished, Task
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+TRIES = 3
+"""A run that so many workers were lost with is not given to another."""
+
+CONNECT_S = 15.0
+"""How long a scheduler may take to answer."""
+
+LOOK_S = 1.0
+"""How often one looks which workers have come and gone."""
+
+ASSEMBLE_S = 30.0
+"""How long the first runs wait for workers that are there, but busy."""
+
+FETCH_S = 60.0
+"""How long a worker that has finished may take to hand over what it has."""
+
+
+def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable[[str], None]) -> Generator[Finished]:
+    """Yield what each task leaves as it ends, from the workers of a Dask cluster.
+
+    Args:
+        tasks: the runs.
+        address: of a scheduler ("tcp://host:8786"), or its scheduler file (.json); or "local", which makes a cluster of
+            processes here for as long as this lasts.
+        jobs: worker processes of a local cluster; 0 for one per core.
+        say: called with what somebody who waits should know.
+
+    Raises:
+        ExperimentError: the extra is missing; the scheduler cannot be reached, or is lost; a worker computes with other
+            versions than this process, by which runs are known.
+    """
+    if not tasks:
+        return
+    with _connected(address, min(jobs or os.cpu_count() or 1, len(tasks)) if address == "local" else jobs) as client:
+        yield from _Crew(client, tasks, say).run()
+
+
+@contextmanager
+def _connected(address: str, jobs: int) -> Iterator[Client]:
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ExperimentError(f"{error}; --dask needs an extra: pip install 'fathom-bench[dask]'") from None
+    if address == "local":
+        from dask.config import set as configured
+
+        with (
+            configured({"distributed.scheduler.worker-ttl": None}),
+            LocalCluster(
+                n_workers=jobs,
+                threads_per_worker=1,
+                memory_limit=0,
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
+                silence_logs=CRITICAL,
+                preload=[f"{__package__}.remote"],
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
+            yield client
+        return
+    if jobs:
+        raise ExperimentError(f"--jobs {jobs}: how many workers there are is the affair of the cluster at {address}")
+    try:
+        client = Client(_scheduler(address), timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ExperimentError(
+            f"--dask {address}: no Dask scheduler answers within {CONNECT_S:.0f} s ({error}); expected local, "
+            "tcp://host:port, or a scheduler file (.json)"
+        ) from None
+    with client:
+        yield client
+
+
+def _scheduler(address: str) -> str:
+    """Return the address in a scheduler file; any other as it is."""
+    if not address.endswith(".json"):
+        return address
+    try:
+        return str(json.loads(Path(address).read_text(encoding="utf-8"))["address"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ExperimentError(
+            f"--dask {address}: not a scheduler file ({type(error).__name__}: {error}); "
+            f"`dask scheduler --scheduler-file {address}` makes one"
+        ) from None
+
+
+@dataclass(eq=False)
+class _Hand:
+    """A worker of the cluster: what it is asked now, and what it said of itself."""
+
+    address: str
+    future: Future
+    greeting: Greeting | None = None
+    task: Task | None = None
+    last: Task | None = None
+    refused: bool = False
+
+    @property
+    def idle(self) -> bool:
+        return self.greeting is not None and self.task is None and not self.refused
+
+
+class _Crew:
+    """The workers of a cluster, and which task each is at."""
+
+    def __init__(self, client: Client, tasks: Sequence[Task], say: Callable[[str], None]) -> None:
+        self.client, self.say, self.queue = client, say, Queue(tasks)
+        self.sweep = uuid4().hex
+        self.estimators = sorted({task.run.estimator.name for task in tasks})
+        self.ours = greeting(self.estimators)
+        self.hands: dict[str, _Hand] = {}
+        self.answered: SimpleQueue[Future] = SimpleQueue()
+        self.lost_with: dict[str, list[str]] = defaultdict(list)
+        self.begun = self.waiting = False
+        self.look_at_s = 0.0
+        self.assembled_by_s = monotonic() + ASSEMBLE_S
+
+    def run(self) -> Iterator[Finished]:
+        """Yield what each task leaves as it ends."""
+        try:
+            while self.queue or any(hand.task for hand in self.hands.values()):
+                yield from self._look()
+                self._hand_out()
+                yield from self._collect()
+        except (OSError, TimeoutError) as error:  # Dask's errors of communication among them
+            where = self.client.scheduler.address if self.client.scheduler else "its address"
+            raise ExperimentError(
+                f"the scheduler at {where} is lost ({error}); what is finished is kept, the same command does the rest"
+            ) from None
+        finally:
+            self._dismiss()
+
+    def _look(self) -> Iterator[Finished]:
+        """Notice who has gone, and whose task failed with that; greet who has come."""
+        if monotonic() < self.look_at_s:
+            return
+        workers: Any = self.client.nthreads()
+        there = set(workers)
+        self.look_at_s = monotonic() + LOOK_S
+        for address in self.hands.keys() - there:
+            yield from self._lost(self.hands.pop(address))
+        for address in there - self.hands.keys():
+            self.hands[address] = _Hand(address, self._ask(address, greet, self.estimators))
+        if not self.hands and not self.waiting:
+            self.say("waiting for workers to join the scheduler (Ctrl-C gives up, and keeps what is finished)")
+        self.waiting = not self.hands
+
+    def _ask(self, address: str, function: Callable[..., Any], *args: Any) -> Future:
+        """Call a function on this worker and no other."""
+        key = f"fathom-{function.__name__}-{uuid4().hex}"
+        future = self.client.submit(function, *args, key=key, workers=[address], allow_other_workers=False)
+        future.add_done_callback(self.answered.put)
+        return future
+
+    def _hand_out(self) -> None:
+        """Give every idle worker a task, once those who were there at first have said what they compute with."""
+        if not self.begun and monotonic() < self.assembled_by_s and not all(h.greeting for h in self.hands.values()):
+            return
+        for hand in self.hands.values():
+            if hand.idle and self.queue:
+                others = [other.last for other in self.hands.values() if other is not hand]
+                hand.task = hand.last = task = self.queue.take(hand.last, others)
+                hand.future = self._ask(hand.address, do, self.sweep, pickle.dumps(task))
+                self.begun = True
+
+    def _collect(self) -> Iterator[Finished]:
+        """Wait a while for an answer, and take it."""
+        try:
+            future = self.answered.get(timeout=LOOK_S)
+        except Empty:
+            return
+        hand = next((hand for hand in self.hands.values() if hand.future is future), None)
+        if hand is None:  # of a worker that is gone
+            return
+        try:
+            answer = future.result(timeout=FETCH_S)
+        except Exception as error:
+            yield from self._failed(hand, error)
+            return
+        finally:
+            future.release()
+        if isinstance(answer, Greeting):
+            self._meet(hand, answer)
+        else:
+            hand.task = None
+            yield answer
+
+    def _meet(self, hand: _Hand, answer: Greeting) -> None:
+        """Let a worker join, unless it would compute something else than its rows say."""
+        hand.greeting = answer
+        mine, theirs = self.ours.versions, answer.versions
+        differ = [
+            f"{name} {theirs.get(name, 'absent')} there, {mine[name]} here"
+            for name in mine
+            if theirs.get(name) != mine[name]
+        ]
+        if differ:
+            self._refuse(hand, f"{'; '.join(differ)}: install the same there, and start it again")
+        elif answer.threads > 1:
+            self.say(
+                f"worker {hand.address} has {answer.threads} threads and is given one run at a time; "
+                "start it with --nthreads 1, and more of them"
+            )
+
+    def _refuse(self, hand: _Hand, why: str) -> None:
+        hand.refused = True
+        if not self.begun:
+            raise ExperimentError(f"worker {hand.address} is not like this process: {why}")
+        self.say(f"worker {hand.address} is left out: {why}")
+
+    def _failed(self, hand: _Hand, error: Exception) -> Iterator[Finished]:
+        """Take what Dask says of a call that did not come to its end."""
+        from distributed import CancelledError, KilledWorker
+
+        if isinstance(error, CancelledError | KilledWorker | OSError | TimeoutError):
+            del self.hands[hand.address]  # if it is still there, it is greeted anew
+            yield from self._lost(hand)
+        elif hand.task is None:
+            hand.greeting = hand.greeting or Greeting({}, {})
+            self._refuse(hand, f"{type(error).__name__}: {error}")
+        else:
+            task, hand.task = hand.task, None
+            yield Finished([task.row("failed", f"{type(error).__name__}: {error}") | _provenance(hand)])
+
+    def _lost(self, hand: _Hand) -> Iterator[Finished]:
+        """Put the task of a worker that is gone back, unless it has cost too many."""
+        self.client.cancel([hand.future], force=True)
+        task = hand.task
+        if task is None:
+            return
+        lost = self.lost_with[task.identity]
+        lost.append(hand.address)
+        if len(lost) < TRIES:
+            self.queue.put_back(task)
+            self.say(f"worker {hand.address} is gone; {task.run} is tried again")
+        else:
+            cause = f"its worker was lost {TRIES} times ({', '.join(lost)}): killed, out of memory, or out of reach"
+            yield Finished([task.row("failed", cause) | _provenance(hand)])
+
+    def _dismiss(self) -> None:
+        """Leave nothing behind: no task at the scheduler, no process at the workers."""
+        with suppress(OSError, TimeoutError, RuntimeError):
+            self.client.cancel([hand.future for hand in self.hands.values()], force=True)
+            self.client.run(dismiss, self.sweep, workers=list(self.hands), on_error="ignore")
+        self.hands.clear()
+
+
+def _provenance(hand: _Hand) -> dict[str, str]:
+    return hand.greeting.provenance if hand.greeting else {}

@@ -1,0 +1,114 @@
+"""On a worker of a Dask cluster: who it is, and a run at a time, in a process like a local worker's.
+
+The run has a process of its own because Dask's must go on answering: GTSAM holds Python's lock through long calls, and
+a worker that is silent for minutes is taken for dead. It also keeps Dask's own work out of the timings, and costs no
+more than itself when it crashes or hangs.
+
+The scheduler imports this module, too; so the rest of the package waits inside the functions.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from multiprocessing.connection import wait
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .pool import Worker
+    from .task import Finished, Task
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What a worker computes with.
+
+    Attributes:
+        versions: as `ledger.versions` gives them, and of the packages that estimators come from.
+        provenance: what its rows say of commit, versions and machine.
+        threads: how many tasks Dask would give it at once.
+    """
+
+    versions: dict[str, str]
+    provenance: dict[str, str]
+    threads: int = 1
+
+
+class _Held:
+    """The process for the runs of one sweep, which keeps logs and compiled code from one run to the next."""
+
+    lock = threading.Lock()
+    sweep: str = ""
+    worker: Worker | None = None
+
+
+def greet(estimators: Sequence[str]) -> Greeting:
+    """Say what this process computes with; `estimators` are the names of those that will be asked for."""
+    from distributed import get_worker
+
+    return replace(greeting(estimators), threads=get_worker().state.nthreads)
+
+
+def greeting(estimators: Sequence[str]) -> Greeting:
+    """Return what this process computes with, on a cluster or not."""
+    from ...estimators.registry import package_of
+    from ..results.identity import versions
+    from ..results.store import provenance
+
+    packages = {f"package of {name}": package_of(name) or "absent" for name in estimators}
+    return Greeting(versions() | packages, provenance())
+
+
+def do(sweep: str, task: bytes) -> Finished:
+    """Do a pickled task in the process that this worker keeps for the sweep, and return what it leaves.
+
+    Where recordings are is this worker's affair: the task's folder if there is such a one here, else FATHOM_DATA.
+    """
+    from .pool import Worker
+
+    with _Held.lock:  # however many threads the worker has: runs at the same time would spoil each other's timings
+        if _Held.worker is None or _Held.sweep != sweep:
+            _let_go()
+            _Held.worker, _Held.sweep = Worker(), sweep
+        worker = _Held.worker
+        worker.begin(_with_data_here(pickle.loads(task)))
+        wait([worker.connection], max(0.0, worker.give_up_s - monotonic()))
+        finished = worker.collect()
+        if worker.task is not None:  # it did not survive
+            _let_go()
+        return finished
+
+
+def dismiss(sweep: str) -> None:
+    """End the sweep's process, and the run that it is at."""
+    worker = _Held.worker
+    if worker is None or _Held.sweep != sweep:
+        return
+    worker.process.kill()  # a `do` that waits for it ends, and lets go of it
+    if _Held.lock.acquire(blocking=False):
+        try:
+            _let_go()
+        finally:
+            _Held.lock.release()
+
+
+def _let_go() -> None:
+    if _Held.worker is not None:
+        _Held.worker.kill()
+        _Held.worker = None
+
+
+def _with_data_here(task: Task) -> Task:
+    if task.data is None or task.data.is_dir() or not os.environ.get("FATHOM_DATA"):
+        return task
+    return replace(task, data=None)
+
+
+def dask_setup(_: Any) -> None:
+    """Leave Ctrl-C to the process that started this one; Dask calls it in workers that preload this module."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

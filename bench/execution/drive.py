@@ -1,0 +1,319 @@
+"""Drive one estimator through one log, time every step, and score what it said."""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from time import perf_counter_ns
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.epochs import Epoch, Voyage, cut
+from ...datasets.log import AttitudeStream, HeadingStream, Log
+from ...datasets.rig import Rig
+from ...datasets.state import Belief, TimeArray
+from ...datasets.trajectory import Trajectory
+from ...estimators.interface import Diverged, Estimator, Pass
+from ...estimators.physics.imu import compile_rig
+from ...estimators.physics.innovation import INNOVATION, innovations
+from .result import Result, Status
+
+LOST_M = 1e7
+"""Nothing on Earth is this far from W's origin, m: an estimate that says so has diverged."""
+
+ON_TIME_NS = 1_000_000
+"""A reading at most this much older than its epoch is true at it."""
+
+
+class Ending(NamedTuple):
+    """How a run ended, and when; t_ns is None for one that came to its end."""
+
+    status: Status
+    cause: str | None = None
+    t_ns: int | None = None
+
+
+class Tape:
+    """Beliefs and times as a run makes them; a belief is copied here, so a pass may reuse its arrays."""
+
+    def __init__(self, ticks: int) -> None:
+        self.step_ns: list[int] = []
+        self.belief_ns: list[int] = []
+        self.t_ns = np.zeros(ticks, np.int64)
+        self.R_WB = np.zeros((ticks, 3, 3))
+        self.vectors = np.zeros((ticks, 4, 3))  # p_WB_W, v_WB_W, b_a, b_g
+        self.P = np.zeros((ticks, 15, 15))
+        self.has_P = True  # settled by the first belief
+
+    def keep(self, belief: Belief, t_ns: int) -> None:
+        """Add a belief.
+
+        Raises:
+            Diverged: it is not finite, is off this planet, or has no covariance although the first one had.
+            ValueError: it is for another time than the t_ns it was asked for.
+        """
+        _check_time(belief, t_ns)
+        k, state = len(self.belief_ns), belief.state
+        self.t_ns[k], self.R_WB[k], self.P[k] = t_ns, state.R_WB, belief.P
+        row = self.vectors[k]
+        row[0], row[1], row[2], row[3] = state.p_WB_W, state.v_WB_W, state.b_a, state.b_g
+        if k == 0:
+            self.has_P = not np.isnan(self.P[0]).all()
+        if not (np.isfinite(row).all() and np.isfinite(self.R_WB[k]).all()):
+            raise Diverged("the state is not finite")
+        if np.abs(row[0]).max() > LOST_M:
+            raise Diverged(f"the position is {np.abs(row[0]).max():.1e} m away")
+        if self.has_P and not np.isfinite(self.P[k]).all():
+            raise Diverged("the covariance is not finite")
+
+    def trajectory(self) -> Trajectory | None:
+        """Return the beliefs that were kept and timed; None where there are none."""
+        n = len(self.belief_ns)
+        if n == 0:
+            return None
+        p, v, b_a, b_g = (self.vectors[:n, i] for i in range(4))
+        return Trajectory(self.t_ns[:n], self.R_WB[:n], p, v, b_a, b_g, self.P[:n] if self.has_P else None)
+
+
+class Examiner:
+    """Judges an estimator by readings that it has not seen yet: the NIS of each, against the belief from before it.
+
+    It asks for the belief between the two halves of an epoch, its motion and its readings. Readings that come late are
+    left out, for they speak of an earlier state; so are those of an estimator that keeps no covariance.
+
+    Attributes:
+        counts: readings left out because they came late ("nis_late"), or because S is not positive ("nis_undefined").
+    """
+
+    def __init__(self, estimator: Estimator, rig: Rig) -> None:
+        self.counts = {"nis_late": 0, "nis_undefined": 0}
+        self._rig = compile_rig(rig, estimator.factors, getattr(estimator, "inflate", {}))
+        self._tables: list[NDArray[Any]] = []
+
+    def wants(self, epoch: Epoch) -> bool:
+        """Return whether any reading of the epoch is on time."""
+        on_time = self._on_time(epoch)
+        self.counts["nis_late"] += len(epoch.readings) - int(on_time.sum())
+        return bool(on_time.any())
+
+    def judge(self, belief: Belief, epoch: Epoch) -> None:
+        """Take the innovations of the epoch's readings, given the belief at its time that has not seen them.
+
+        Raises:
+            ValueError: the belief is for another time.
+        """
+        _check_time(belief, epoch.t_ns)
+        if np.isnan(belief.P).all():
+            return
+        table = innovations(belief, epoch.readings[self._on_time(epoch)], self._rig)
+        defined = np.isfinite(table["nis"])
+        self.counts["nis_undefined"] += int((~defined).sum())
+        self._tables.append(table[defined])
+
+    def table(self) -> NDArray[Any]:
+        """Return all that was taken, as INNOVATION rows."""
+        return np.concatenate([np.zeros(0, INNOVATION), *self._tables])
+
+    @staticmethod
+    def _on_time(epoch: Epoch) -> NDArray[np.bool_]:
+        return epoch.t_ns - epoch.readings["t_ns"] <= ON_TIME_NS
+
+
+def _check_time(belief: Belief, t_ns: int) -> None:
+    if belief.t_ns != t_ns:
+        raise ValueError(f"asked for a belief at {t_ns} ns, was given one at {belief.t_ns} ns")
+
+
+def run_log(
+    log: Log,
+    estimator: Estimator,
+    *,
+    score_period_s: float = 1.0,
+    max_gap_s: float = 1.0,
+    timeout_s: float | None = None,
+    nis: bool = False,
+) -> Result:
+    """Drive an estimator through a log, in the order of reception.
+
+    Whatever the estimator raises ends the run, not the caller; only KeyboardInterrupt and its like pass through.
+
+    Args:
+        log: where it states no prior, `initialise` makes one.
+        estimator: a configuration, as `create` returns it; it gets the sensors of its `factors`.
+        score_period_s: beliefs are asked for this far apart: at the truth's own stamps, else on a regular grid.
+        max_gap_s: longest gap in the IMU that is bridged.
+        timeout_s: longest time for the whole run, looked at after each step; None for no limit.
+        nis: judge the estimator by its innovations. It then gets each epoch in two halves, first the motion without
+            readings, then the readings without motion, and is asked for its belief in between. A step's time is that of
+            both halves; the belief is not charged, but what it leaves computed may make a smoother's next step cheaper.
+            What is said stays the same, but for a graph smoother with late readings: asked for a belief, it takes their
+            factors in at once and not with its next keyframe.
+
+    Raises:
+        DatasetError: no prior can be made for the log.
+    """
+    log, start, notes = _with_prior(log)
+    assert log.prior is not None
+    readings = sum(len(stream) for sensor, stream in log.streams.items() if sensor in estimator.factors)
+    limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
+    smoothed, finish_ns, counts = None, 0, {}
+    examiner = Examiner(estimator, log.rig) if nis else None
+    with _collector_off():
+        voyage = cut(log, score_ticks(log, score_period_s), estimator.factors, max_gap_s)
+        tape = Tape(sum(epoch.tick for epoch in voyage.epochs))
+        try:
+            run = estimator.begin(log.prior, log.rig)
+        except Diverged as error:
+            ending = Ending("diverged", str(error), voyage.start_ns)
+        except Exception as error:
+            ending = Ending("failed", _describe(error), voyage.start_ns)
+        else:
+            ending = _drive(run, voyage, tape, limit_ns, examiner)
+            smoothed, finish_ns, ending = _finish(run, voyage, ending)
+            counts = dict(run.counts)
+
+    driven = voyage.epochs[: len(tape.step_ns)]
+    return Result(
+        ending.status,
+        ending.cause,
+        None if ending.t_ns is None else (ending.t_ns - voyage.start_ns) * 1e-9,
+        tape.trajectory(),
+        smoothed,
+        np.array(tape.step_ns, np.int64),
+        np.array(tape.belief_ns, np.int64),
+        finish_ns,
+        {"readings": readings} | voyage.counts | (examiner.counts if examiner else {}) | counts,
+        (driven[-1].t_ns - voyage.start_ns) * 1e-9 if driven else 0.0,
+        sum(len(epoch.imu) for epoch in driven),
+        start,
+        notes,
+        examiner.table() if examiner else None,
+    )
+
+
+def _with_prior(log: Log) -> tuple[Log, str, tuple[str, ...]]:
+    """Return the log with a prior, where that came from, and in sentences how it was made."""
+    if log.prior is not None:
+        return log, "given", ()
+    from ...estimators.alignment.initialise import initialise
+
+    found = initialise(log)
+    return log.with_prior(found.belief), found.start, found.notes
+
+
+def _drive(run: Pass, voyage: Voyage, tape: Tape, limit_ns: float, examiner: Examiner | None) -> Ending:
+    """Hand over every epoch, in halves for an examiner; time `step` and `belief` apart, and collect garbage outside."""
+    clock, step, step_ns = perf_counter_ns, run.step, tape.step_ns.append
+    t_ns = voyage.start_ns
+    try:
+        for epoch in voyage.epochs:
+            t_ns, spent_ns = epoch.t_ns, 0
+            if examiner is not None and examiner.wants(epoch):
+                started = clock()
+                step(epoch._replace(readings=epoch.readings[:0], tick=False))
+                spent_ns = clock() - started
+                examiner.judge(run.belief(), epoch)
+                epoch = epoch._replace(imu=epoch.imu[:0])
+            started = clock()
+            step(epoch)
+            ended = clock()
+            step_ns(spent_ns + ended - started)
+            if ended > limit_ns:
+                return Ending("failed", "out of time", t_ns)
+            if epoch.tick:
+                started = clock()
+                belief = run.belief()
+                ended = clock()
+                tape.keep(belief, t_ns)
+                tape.belief_ns.append(ended - started)
+                gc.collect(0)
+    except Diverged as error:
+        return Ending("diverged", str(error), t_ns)
+    except Exception as error:
+        return Ending("failed", _describe(error), t_ns)
+    if voyage.failure is not None:
+        return Ending("failed", voyage.failure, t_ns)
+    return Ending("done")
+
+
+def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | None, int, Ending]:
+    """Return (hindsight, time it took, ending); a run that had ended early keeps its own cause."""
+    started = perf_counter_ns()
+    smoothed = None
+    try:
+        smoothed = run.finish()
+        if smoothed is not None and not (np.abs(smoothed.p_WB_W).max(initial=0.0) < LOST_M):  # nor NaN
+            smoothed = None
+            raise Diverged("the state with hindsight is not finite, or off this planet")
+    except Exception as error:
+        if ending.status == "done":
+            lost = isinstance(error, Diverged)
+            end_ns = voyage.epochs[-1].t_ns if voyage.epochs else voyage.start_ns
+            ending = Ending("diverged" if lost else "failed", str(error) if lost else _describe(error), end_ns)
+    return smoothed, perf_counter_ns() - started, ending
+
+
+def _describe(error: Exception) -> str:
+    """Name the type and what it says, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+@contextmanager
+def _collector_off() -> Iterator[None]:
+    """Keep Python's garbage collector from landing in somebody's step."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def score_ticks(log: Log, period_s: float) -> TimeArray:
+    """Return the times at which beliefs are asked for, (k,) ns.
+
+    With truth they are its own stamps, so that nobody interpolates: the nearest to each point of a regular grid that
+    begins one period after the start. Without, or where it is empty, a regular grid from the start.
+    """
+    period_ns = int(period_s * 1e9)
+    if log.truth is None or len(log.truth) == 0:
+        return np.arange(log.start_ns + period_ns, int(log.imu.t_ns[-1]) + 1, period_ns, dtype=np.int64)
+    stamps, first_ns = log.truth.t_ns, log.start_ns + period_ns
+    begin_ns = stamps[np.abs(stamps - first_ns).argmin()]
+    grid = np.arange(begin_ns, stamps[-1] + 1, period_ns)
+    after = np.searchsorted(stamps, grid)
+    before = (after - 1).clip(0)
+    return np.unique(stamps[np.where(grid - stamps[before] <= stamps[after] - grid, before, after)])
+
+
+# -- scores -----------------------------------------------------------------------------------------------------------
+
+
+# -- before a run -----------------------------------------------------------------------------------------------------
+
+
+def warm_up(estimator: Estimator) -> None:
+    """Run the estimator over a few simulated seconds, so that compiling is over before anything is timed.
+
+    Once with a heading sensor, once with one that gives the full attitude.
+    """
+    from ...datasets.simulated.scenario import Scenario
+    from ...datasets.simulated.simulator import simulate
+
+    log = simulate(Scenario(duration_s=20.0), seed=0)
+    run_log(log, estimator)
+    if isinstance(log.heading, HeadingStream):
+        run_log(replace(log, heading=_level_attitude(log.heading)), estimator)
+
+
+def _level_attitude(heading: HeadingStream) -> AttitudeStream:
+    """Return the headings as full attitudes, roll and pitch being level."""
+    c, s, zero = np.cos(heading.z[:, 0]), np.sin(heading.z[:, 0]), np.zeros(len(heading))
+    z = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1], axis=1)
+    return AttitudeStream(heading.t_ns, heading.received_ns, z, np.repeat(heading.sigma, 3, axis=1))

@@ -1,0 +1,158 @@
+"""Local workers: processes that do one task at a time, which task each is given, and what becomes of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections import deque
+from collections.abc import Collection, Generator, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from multiprocessing import Pipe
+from multiprocessing.connection import wait
+from subprocess import PIPE, Popen, TimeoutExpired
+from typing import Any, TypeAlias
+
+from .task import Finished, Task
+
+THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")
+"""What libraries read when a process starts; timings are single-threaded."""
+
+GRACE_S = 120.0
+"""A worker that is this far past its run's timeout hangs inside one call, and is killed."""
+
+LogName: TypeAlias = tuple[str, int | None]
+"""A log of one experiment: its name and seed."""
+
+
+class Queue:
+    """Tasks that wait, in order, except that those on one log go to one worker as long as the others have logs too."""
+
+    def __init__(self, tasks: Iterable[Task]) -> None:
+        self._by_log: dict[LogName, deque[Task]] = {}
+        for task in tasks:
+            self._by_log.setdefault(log_of(task), deque()).append(task)
+
+    def __bool__(self) -> bool:
+        return bool(self._by_log)
+
+    def take(self, last: Task | None, others: Collection[Task | None]) -> Task:
+        """Return the next task for a worker, given its last one and those of the other workers.
+
+        It is on the log that the worker has in memory; else on the first that no other worker has; else on the first.
+        """
+        mine, theirs = last and log_of(last), {log_of(task) for task in others if task}
+        if mine not in self._by_log:
+            mine = next((log for log in self._by_log if log not in theirs), next(iter(self._by_log)))
+        tasks = self._by_log[mine]
+        task = tasks.popleft()
+        if not tasks:
+            del self._by_log[mine]
+        return task
+
+    def put_back(self, task: Task) -> None:
+        """Return a task whose worker was lost; it is the next on its log."""
+        self._by_log.setdefault(log_of(task), deque()).appendleft(task)
+
+
+def log_of(task: Task) -> LogName:
+    """Return the name of the task's log within its experiment."""
+    return task.run.log.name, task.run.seed
+
+
+def start(descriptor: int) -> Popen[bytes]:
+    """Start a process that does the tasks that come through a connection.
+
+    Libraries in it are single-threaded. It is in a group of its own, where Ctrl-C does not reach it, and ends when the
+    process that started it does.
+    """
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    return Popen(
+        [sys.executable, "-P", "-c", f"from fathom.bench.execution.worker import main; main({descriptor})"],
+        stdin=PIPE,
+        pass_fds=[descriptor],
+        process_group=0,
+        env=os.environ | dict.fromkeys(THREAD_COUNTS, "1") | {"PYTHONPATH": path},
+    )
+
+
+@dataclass(eq=False)
+class Worker:
+    """One process, with the task it is at, and the last it was at."""
+
+    connection: Any = field(init=False)
+    process: Any = field(init=False)
+    task: Task | None = None
+    last: Task | None = None
+    give_up_s: float = float("inf")
+
+    def __post_init__(self) -> None:
+        self.connection, theirs = Pipe()
+        with theirs:
+            self.process = start(theirs.fileno())
+
+    def begin(self, task: Task) -> None:
+        """Hand over a task; a worker that is already dead is found out by `wait`."""
+        self.task = self.last = task
+        self.give_up_s = time.monotonic() + 2 * task.timeout_s + GRACE_S
+        with suppress(OSError):
+            self.connection.send(task)
+
+    def collect(self) -> Finished:
+        """Return what the task left, once the connection is ready or time is out.
+
+        The task stays with the worker where that is lost, and is to be killed.
+        """
+        task = self.task
+        assert task is not None
+        if not self.connection.poll():
+            return Finished([task.row("failed", "out of time: hung inside one call; its worker was killed")])
+        try:
+            finished = self.connection.recv()
+        except (EOFError, OSError):
+            with suppress(TimeoutExpired):
+                self.process.wait(10)
+            return Finished([task.row("failed", f"worker died (exit code {self.process.returncode})")])
+        self.task = None
+        return finished
+
+    def kill(self) -> None:
+        """End the process, whatever it is doing."""
+        self.process.kill()
+        self.process.wait()
+        self.connection.close()
+        if self.process.stdin is not None:
+            self.process.stdin.close()
+
+
+def run_all(tasks: Sequence[Task], jobs: int = 0) -> Generator[Finished]:
+    """Yield what each task leaves as it ends, from `jobs` worker processes (0: one per core).
+
+    Each worker has one task at a time, so a death is that task's, and is made good by a fresh worker.
+    """
+    queue = Queue(tasks)
+    workers = [Worker() for _ in range(min(jobs or os.cpu_count() or 1, len(tasks)))]
+    try:
+        while queue or any(worker.task for worker in workers):
+            for worker in workers:
+                if worker.task is None and queue:
+                    others = [other.last for other in workers if other is not worker]
+                    worker.begin(queue.take(worker.last, others))
+            busy = [worker for worker in workers if worker.task]
+            ready = wait([worker.connection for worker in busy], max(0.0, _soonest(busy) - time.monotonic()))
+            for worker in busy:
+                if worker.connection not in ready and time.monotonic() <= worker.give_up_s:
+                    continue
+                finished = worker.collect()
+                if worker.task is not None:  # it did not survive
+                    worker.kill()
+                    workers[workers.index(worker)] = Worker()
+                yield finished
+    finally:
+        for worker in workers:
+            worker.kill()
+
+
+def _soonest(workers: Sequence[Worker]) -> float:
+    return min(worker.give_up_s for worker in workers)

@@ -1,0 +1,146 @@
+"""A run on its way: what goes to a worker, wherever that is, and what comes back."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...datasets.trajectory import Trajectory
+from ..errors import ExperimentError
+from ..experiment.plan import Experiment, Run
+from ..metrics.scoring import Scoring
+from ..results.identity import identity
+from ..results.store import Row, provenance
+
+
+@dataclass(frozen=True)
+class Task:
+    """One run and all a worker needs for it, as descriptions: a few kilobytes, however many runs there are.
+
+    Attributes:
+        experiment: its name.
+        run: which log, estimator and seed.
+        scoring, max_gap_s, timeout_s: the experiment's, for this log.
+        spec: all that decides the run's numbers but readings and versions, see `Experiment.spec`.
+        lags_s: those of all estimators of the experiment, whose floors are found together.
+        data: where recorded logs are.
+        repair: let loaders drop bad rows.
+        readings_sha256: of a recorded log, or of a simulated one's recorded path; see `ledger.identity`.
+    """
+
+    experiment: str
+    run: Run
+    scoring: Scoring
+    max_gap_s: float
+    timeout_s: float
+    spec: dict[str, Any]
+    lags_s: tuple[float, ...]
+    data: Path | None = None
+    repair: bool = False
+    readings_sha256: str | None = None
+
+    @staticmethod
+    def of(experiment: Experiment, run: Run, data: Path | None = None, repair: bool = False) -> Task:
+        """Return the task of one of the experiment's runs."""
+        return Task(
+            experiment.name,
+            run,
+            experiment.scoring(run.log),
+            experiment.max_gap_s,
+            experiment.timeout_s,
+            experiment.spec(run, repair),
+            tuple(sorted({estimator.lag_s for estimator in experiment.estimators})),
+            data,
+            repair,
+        )
+
+    @cached_property
+    def identity(self) -> str:
+        """What tells this run from any other."""
+        return identity(self.spec, self.readings_sha256)
+
+    def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
+        """Return what a row says whether the run succeeds or not."""
+        run = self.run
+        return {
+            "experiment": self.experiment,
+            "log": run.log.name,
+            "label": run.estimator.label,
+            "seed": run.seed,
+            "output": output,
+            "status": status,
+            "cause": cause,
+            "align": self.scoring.align,
+            "dims": self.scoring.dims,
+            "estimator": run.estimator.name,
+            "identity": self.identity,
+            "spec": json.dumps(self.spec),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        } | provenance()
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a run leaves: its rows, one per output, and its trajectories, by file name, as the bytes of a Parquet file.
+
+    A worker writes no files, so it may be anywhere.
+    """
+
+    rows: list[Row]
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def keep(self, folder: Path) -> list[Row]:
+        """Write the trajectories into trajectories/ of this folder, each whole or not at all, and return the rows.
+
+        A name stands for its content or its run, so a truth that is there already is left alone.
+
+        Raises:
+            ExperimentError: the disk is full, or the folder cannot be written.
+        """
+        folder = folder / "trajectories"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, content in self.files.items():
+                unfinished = folder / f"{name}.{os.getpid()}"
+                unfinished.write_bytes(content)
+                unfinished.replace(folder / name)
+        except OSError as error:
+            raise ExperimentError(f"{folder}: cannot write ({error.strerror}); the runs before are kept") from None
+        return self.rows
+
+
+def file_name(task: Task, output: str, content: str) -> str:
+    """Return the name of a trajectory's file.
+
+    It ends in the identity of the run (of the content, for the truth, which runs share): so a file is never written
+    over with another's content, and a row that stands keeps its own.
+    """
+    label = task.run.estimator.label if output != "truth" else ""
+    seed = "" if task.run.seed is None else str(task.run.seed)
+    parts = (task.run.log.name, label, seed, output, content[:8])
+    return "--".join(_file_part(part) for part in parts if part) + ".parquet"
+
+
+def parquet(trajectory: Trajectory) -> bytes:
+    """Return a trajectory as the content of a Parquet file; of the covariance, the 3 × 3 blocks."""
+    table = trajectory.to_pandas()
+    across = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15) if i // 3 != j // 3]
+    table = table.drop(columns=across, errors="ignore")
+    with np.errstate(over="ignore"):  # a covariance on its way to infinity may get there
+        table = table.astype({column: "float32" for column in table if column.startswith("P_")})
+    return table.to_parquet(index=False)
+
+
+def _file_part(text: str) -> str:
+    """Return the text as a file name may hold it; a changed text gains a few letters of its own."""
+    safe = re.sub(r"[^\w.=+-]+", "_", text)
+    return safe if safe == text else f"{safe}-{sha256(text.encode()).hexdigest()[:4]}"

@@ -1,0 +1,217 @@
+"""In a worker: open a task's log, run its estimator, score what it said, and hand back rows and trajectories."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import math
+import os
+import threading
+from collections import OrderedDict
+from contextlib import suppress
+from datetime import UTC, datetime
+from multiprocessing.connection import Connection
+from pathlib import Path
+from platform import node
+
+import numpy as np
+
+from ...datasets.errors import DatasetError
+from ...datasets.log import Log
+from ...datasets.simulated.scenario import Scenario
+from ...estimators.interface import Estimator
+from ..experiment.plan import plain
+from ..metrics import ScoreError
+from ..metrics.consistency import nees_at
+from ..metrics.floor import Floor, floors
+from ..metrics.floor_ratio import FLOORS, floor_scores
+from ..metrics.scoring import can_judge, scores
+from ..results.identity import content_sha256
+from ..results.store import Row
+from .drive import run_log, warm_up
+from .result import Result, costs, innovation_dof, innovation_scores
+from .task import Finished, Task, file_name, parquet
+
+LOGS_KEPT = 2
+"""How many logs a worker keeps in memory, so that estimators share them."""
+
+
+def main(descriptor: int) -> None:
+    """Be a worker process: do the tasks that come through a connection, as long as there is a parent."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    work(Connection(descriptor))
+
+
+def _end_with_parent() -> None:
+    """Wait until the standard input closes, as it does when the parent is gone, however it went; then end at once."""
+    os.read(0, 1)
+    os._exit(1)
+
+
+def work(connection: Connection) -> None:
+    """Do tasks until there are no more, or nobody to tell."""
+    bench = Bench()
+    while True:
+        try:
+            connection.send(bench.execute(connection.recv()))
+        except (EOFError, OSError):
+            return
+
+
+class Bench:
+    """What a worker keeps from one task to the next: the last logs with what is made of them, what is compiled."""
+
+    def __init__(self) -> None:
+        self.logs: OrderedDict[str, Log] = OrderedDict()
+        self.floors: dict[str, dict[float, Floor]] = {}
+        self.truth: dict[str, bytes] = {}
+        self.warm: set[str] = set()
+
+    def execute(self, task: Task) -> Finished:
+        """Do one run and return what it leaves, whatever happens."""
+        started = datetime.now(UTC).isoformat(timespec="seconds")
+        try:
+            log = self.open(task)
+            estimator = self.estimator(task)
+            with _PeakMemory() as memory:
+                result = run_log(
+                    log,
+                    estimator,
+                    score_period_s=task.scoring.score_period_s,
+                    max_gap_s=task.max_gap_s,
+                    timeout_s=task.timeout_s,
+                    nis=task.scoring.nis,
+                )
+            return self.finished(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
+        except Exception as error:
+            return Finished([task.row("failed", f"{type(error).__name__}: {error}") | {"started": started}])
+
+    def open(self, task: Task) -> Log:
+        """Open or simulate the task's log, unless it is one of the last.
+
+        Raises:
+            DatasetError: it cannot be read, or its readings are not those that the task is about.
+        """
+        key = log_key(task)
+        if key not in self.logs:
+            self.logs[key] = open_same(task)
+        self.logs.move_to_end(key)
+        while len(self.logs) > LOGS_KEPT:
+            gone, _ = self.logs.popitem(last=False)
+            self.floors = {of: floors for of, floors in self.floors.items() if not of.startswith(gone)}
+        return self.logs[key]
+
+    def estimator(self, task: Task) -> Estimator:
+        """Return the task's estimator, compiled."""
+        estimator = task.run.estimator.create()
+        if repr(estimator) not in self.warm:
+            warm_up(estimator)
+            self.warm.add(repr(estimator))
+        return estimator
+
+    def floor(self, task: Task, result: Result, lookahead_s: float) -> dict[str, float | None]:
+        """Return the scores of FLOORS for one look-ahead; None where there are none: of a recorded log, say.
+
+        The floors of all the experiment's lags are found together, once for all estimators that use the same sensors.
+        """
+        run, scoring = task.run, task.scoring
+        asked = scoring.floor and run.log.scenario is not None and (scoring.align, scoring.dims) == ("none", "3d")
+        if not asked or result.status != "done" or result.online is None:
+            return dict.fromkeys(FLOORS)
+        assert run.seed is not None
+        factors = run.estimator.create().factors
+        key = f"{log_key(task)} {sorted(factors)} {scoring.score_period_s} {task.max_gap_s}"
+        if lookahead_s not in self.floors.get(key, {}):
+            scenario = Scenario.from_dict(run.log.scenario or {})
+            wanted = sorted({0.0, math.inf, lookahead_s, *task.lags_s})
+            self.floors[key] = floors(scenario, run.seed, result.online.t_ns, wanted, factors, task.max_gap_s)
+        return floor_scores(self.floors[key][lookahead_s], result.online.t_ns)
+
+    def finished(self, task: Task, log: Log, result: Result, extra: Row) -> Finished:
+        """Score a run: one row per output, and its trajectories beside them."""
+        scoring = task.scoring
+        files: dict[str, bytes] = {}
+        shared = {
+            "failed_at_s": result.failed_at_s,
+            "truth_kind": log.truth_kind if log.truth is not None else None,
+            "duration_s": result.duration_s,
+            "start": result.start,
+            "counts": json.dumps(plain(result.counts)),
+            "notes": json.dumps([*log.notes, *result.notes]),
+            **costs(result),
+            **extra,
+        }
+        if log.truth is not None and result.online is not None:
+            known = log.truth.select(np.flatnonzero(np.isin(log.truth.t_ns, result.online.t_ns)))
+            name = shared["truth_trajectory"] = file_name(task, "truth", content_sha256(known))
+            if name not in self.truth:  # the estimators of a log share it
+                self.truth = {name: parquet(known)}
+            files |= self.truth
+        rows = []
+        for output, trajectory in result.outputs.items():
+            name = file_name(task, output, task.identity)
+            files[name] = parquet(trajectory)
+            row = task.row(result.status, result.cause, output) | shared | scores(log, trajectory, scoring)
+            if output == "online":
+                row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
+            try:
+                row |= self.floor(task, result, trajectory.lookahead_s)
+            except ScoreError as error:  # a look-ahead that is none, say: the run is none the worse
+                row["notes"] = json.dumps([*log.notes, *result.notes, str(error)])
+            if can_judge(log, scoring):
+                row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
+            rows.append(row | {"lookahead_s": trajectory.lookahead_s, "trajectory": name})
+        return Finished(rows or [task.row(result.status, result.cause) | shared], files)
+
+
+def log_key(task: Task) -> str:
+    """Return what tells the task's log from any other."""
+    return json.dumps([plain(task.run.log), task.run.seed, task.repair, str(task.data), task.readings_sha256])
+
+
+def open_same(task: Task) -> Log:
+    """Open or simulate the task's log.
+
+    Raises:
+        DatasetError: it cannot be read; or its readings are not those by which the run is known, as where another
+            machine holds another recording under the same name.
+    """
+    spec, expected = task.run.log, task.readings_sha256
+    log = spec.open(task.run.seed, task.data, task.repair)
+    if expected is not None:
+        found = content_sha256(log) if spec.scenario is None else spec.path_sha256
+        if found != expected:
+            what = "recording" if spec.scenario is None else "recorded path"
+            raise DatasetError(
+                f"{spec.name}: the {what} on {node()} differs from the one where the run was planned "
+                f"(SHA-256 {str(found)[:8]}… here, {expected[:8]}… there); copy it there, or mend --data or FATHOM_DATA"
+            )
+    return log
+
+
+class _PeakMemory:
+    """Highest resident memory within the block above that at its start, MB; None where the system does not tell."""
+
+    def __enter__(self) -> _PeakMemory:
+        self.peak_mb: float | None = None
+        gc.collect()
+        with suppress(AttributeError, OSError):  # glibc's; or this run would hide in what earlier ones left
+            ctypes.CDLL(None).malloc_trim(0)
+        try:
+            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak restarts from here
+            self.start_kb = self._status("VmRSS")
+        except OSError:
+            self.start_kb = None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.start_kb is not None:
+            self.peak_mb = (self._status("VmHWM") - self.start_kb) / 1024
+
+    @staticmethod
+    def _status(key: str) -> float:
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith(key):
+                return float(line.split()[1])
+        raise OSError(f"/proc/self/status has no {key}")

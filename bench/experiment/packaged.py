@@ -1,0 +1,12 @@
+"""The experiments that come with Fathom, found without all that it takes to read one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SHIPPED = Path(__file__).parents[1] / "experiments"
+
+
+def shipped_experiments() -> dict[str, Path]:
+    """Return the experiments that come with Fathom, by name."""
+    return {path.stem: path for path in sorted(SHIPPED.glob("*.yaml"))}

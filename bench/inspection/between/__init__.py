@@ -1,0 +1,1 @@
+"""What is looked at between streams: clocks, mountings, lever arms, references."""

@@ -1,0 +1,162 @@
+"""One story of all clocks: every delay met between two streams, weighed together, against the IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.stats import chi2
+
+from ....datasets.log import Log
+from ..findings.finding import Check, Finding
+from .answers import Delay
+from .fitting import FALSE_ALARM, Estimate
+from .inertial import seconds
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DELAY_MATTERS_S = 0.05
+TRUTH_DELAY_MATTERS_S = 0.1
+WELL_KNOWN_S = 0.2
+FLOOR_S = 0.005
+"""No delay is believed beyond this: half a sample of a fast IMU."""
+PARTS = ("truth position", "truth velocity", "truth attitude")
+
+
+@dataclass(frozen=True)
+class Story:
+    """How late (s) each stream's stamps are by the IMU's clock, and whether the delays agree on it.
+
+    Attributes:
+        late: by stream, those that a chain of delays ties to the IMU.
+        agrees: whether what is left over is chance; delays up to `DELAY_MATTERS_S` are let pass.
+        worst: the delay that fits worst.
+    """
+
+    late: dict[str, Estimate]
+    agrees: bool
+    worst: Delay | None
+
+
+def weigh(delays: Sequence[Delay]) -> Story:
+    """Return the least-squares lateness of every stream that is tied to the IMU."""
+    tied = {"imu"}
+    while grown := {s for d in delays if {d.late, d.than} & tied for s in (d.late, d.than)} - tied:
+        tied |= grown
+    used = [d for d in delays if d.late in tied]
+    names = sorted(tied - {"imu"})
+    if not names:
+        return Story({}, True, None)
+    A = np.zeros((len(used), len(names)))
+    for row, d in enumerate(used):
+        for name, sign in ((d.late, 1.0), (d.than, -1.0)):
+            if name != "imu":
+                A[row, names.index(name)] = sign
+    by = np.array([d.by.value for d in used])
+    sigma = np.array([np.hypot(d.by.sigma, FLOOR_S) for d in used])
+    cov = np.linalg.inv((A / sigma[:, None]).T @ (A / sigma[:, None]))
+    late = cov @ A.T @ (by / sigma**2)
+    left = by - A @ late
+    dof = min(d.by.dof for d in used)
+    loops = len(used) - len(names)
+    excess = np.maximum(np.abs(left) - DELAY_MATTERS_S, 0.0) / sigma
+    agrees = loops == 0 or float(np.sum(excess**2)) < chi2.isf(FALSE_ALARM, loops)
+    found = {n: Estimate(float(late[i]), float(np.sqrt(cov[i, i])), dof) for i, n in enumerate(names)}
+    return Story(found, bool(agrees), used[int(np.argmax(excess))] if not agrees else None)
+
+
+def clock_check(log: Log, delays: Sequence[Delay]) -> Check:
+    """Weigh the delays, and say whose clock is wrong and by how much."""
+    story = weigh(delays)
+    facts = {f"{name} later than the IMU by": late.text("s") for name, late in story.late.items()}
+    facts |= _overlaps(log)
+    findings = []
+    off = {n: e for n, e in story.late.items() if e.differs(0.0, _matters(n))}
+    sensors = {n: e for n, e in story.late.items() if n not in PARTS}
+    known = {n for n, e in sensors.items() if e.known_to(WELL_KNOWN_S)}
+    common = _common(sensors) if len(known) > 1 and known <= set(off) else None
+    if common is not None:
+        says = (
+            f"Every other stream is {_late(common)} by the IMU's clock, and they agree among themselves: it is the "
+            "IMU's clock that is wrong."
+        )
+        findings.append(Finding("imu", says, mend("imu", common.times(-1))))
+    else:
+        findings += [_finding(name, off[name]) for name in off if name not in PARTS]
+        findings += _truth_findings(log, {n: e for n, e in story.late.items() if n in PARTS}, set(off))
+    if story.worst is not None and not findings:
+        worst = story.worst
+        says = (
+            f"The delays do not fit one clock per stream: {worst.late} is later than {worst.than} by "
+            f"{worst.by.text('s')}, which the others contradict."
+        )
+        findings.append(Finding(worst.late.split()[0], says))
+
+    def draw(axes: Axes) -> None:
+        for row, d in enumerate(delays):
+            axes.errorbar(d.by.value, row, xerr=3 * d.by.sigma, fmt="o", markersize=3)
+        axes.set_yticks(range(len(delays)), [f"{d.late} after {d.than}" for d in delays])
+        axes.axvline(0.0, linewidth=0.5)
+        axes.set(xlabel="delay (s), three sigmas", title="clocks")
+
+    return Check("clocks", facts, tuple(findings), draw if delays else None)
+
+
+def _matters(name: str) -> float:
+    return TRUTH_DELAY_MATTERS_S if name in PARTS else DELAY_MATTERS_S
+
+
+def _common(late: dict[str, Estimate]) -> Estimate | None:
+    """Return the lateness that all share; None where they differ."""
+    weight = np.array([1 / np.hypot(e.sigma, FLOOR_S) ** 2 for e in late.values()])
+    value = np.array([e.value for e in late.values()])
+    mean = float(np.sum(weight * value) / np.sum(weight))
+    close = all(abs(e.value - mean) < max(3 * e.sigma, DELAY_MATTERS_S) for e in late.values())
+    return Estimate(mean, float(1 / np.sqrt(np.sum(weight))), min(e.dof for e in late.values())) if close else None
+
+
+def _late(by: Estimate) -> str:
+    return f"{Estimate(abs(by.value), by.sigma).text('s')} {'late' if by.value > 0 else 'early'}"
+
+
+def mend(stream: str, late: Estimate) -> str:
+    """Return what brings a stream onto the IMU's clock."""
+    path = "truth" if stream == "truth" else f"streams.{stream}"
+    if late.value > 0 and stream not in ("imu", "truth"):
+        return f"{path}.time.delay_s: {late.value:.3f}"
+    return f"{path}.time.clock_offset_s: {-late.value:.3f}"
+
+
+def _finding(name: str, late: Estimate) -> Finding:
+    says = f"The stamps of {name} are {_late(late)} by the IMU's clock."
+    if late.value > 0:
+        says += f" Where `time.received` is a column: `time.clock_offset_s: {-late.value:.3f}`."
+    return Finding(name, says, mend(name, late))
+
+
+def _truth_findings(log: Log, parts: dict[str, Estimate], off: set[str]) -> list[Finding]:
+    if not set(parts) & off:
+        return []
+    whose = log.truth_kind
+    common = _common(parts)
+    if common is not None:
+        return [Finding("truth", f"The {whose} is {_late(common)} by the IMU's clock.", mend("truth", common))]
+    listed = ", ".join(f"{name.split()[1]} {_late(late)}" for name, late in parts.items())
+    return [Finding("truth", f"The {whose} is not of one time by the IMU's clock: {listed}.")]
+
+
+def _overlaps(log: Log) -> dict[str, str]:
+    """Return how much of the IMU's time each stream covers, where that is not all."""
+    said = {}
+    end = seconds(log, log.imu.t_ns[-1:])[0]
+    spans = {name: seconds(log, stream.t_ns) for name, stream in log.streams.items() if len(stream)}
+    if log.truth is not None and len(log.truth):
+        spans[log.truth_kind] = seconds(log, log.truth.t_ns)
+    for name, t_s in spans.items():
+        begin, last = max(float(t_s[0]), 0.0), min(float(t_s[-1]), float(end))
+        if last - begin < 0.98 * end:
+            said[f"{name} covers"] = f"{begin:.1f} s to {last:.1f} s of the IMU's {end:.1f} s"
+    return said

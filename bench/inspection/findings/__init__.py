@@ -1,0 +1,1 @@
+"""What a check hands over: facts, findings with their remedy, and a panel for the page."""

@@ -1,0 +1,105 @@
+"""A log as channels: the values of one quantity over time, with what the log states of their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ....datasets.log import AttitudeStream, Log, ReadingStream
+from ....datasets.state import Array, TimeArray
+from .steps import Steps, steps_of
+
+DEGREE = np.pi / 180
+XYZ, ENU = ("x", "y", "z"), ("east", "north", "up")
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One quantity of one stream.
+
+    Attributes:
+        stream: as the description calls it: "imu", "dvl".
+        name: "gyro", "accel", and otherwise the stream's.
+        quantity: the key of log.yaml that names its columns: "gyro", "velocity", "depth".
+        t_ns: (n,)
+        x: (n, k) what was read, SI, in the axes of the log; angles without their jumps of a turn.
+        sigma: (k,) what the log states of one reading: the median over its rows, inf where it was not measured.
+        unit: in which figures are told.
+        shown: how many of these one SI unit is.
+        axes: (k,) names.
+        turn: what a full turn adds to x, 0 where the quantity is no angle.
+    """
+
+    stream: str
+    name: str
+    quantity: str
+    t_ns: TimeArray
+    x: Array
+    sigma: Array
+    unit: str
+    shown: float
+    axes: tuple[str, ...]
+    turn: float = 0.0
+
+    @property
+    def period_s(self) -> float:
+        """Median interval; NaN where there is none."""
+        return float(np.median(np.diff(self.t_ns))) * 1e-9 if len(self.t_ns) > 1 else float("nan")
+
+    @property
+    def raw(self) -> Array:
+        """(n, k) x, angles within half a turn of zero."""
+        return self.x - self.turn * np.rint(self.x / self.turn) if self.turn else self.x
+
+    @cached_property
+    def steps(self) -> list[Steps]:
+        """How finely each axis is told."""
+        return [steps_of(axis) for axis in self.raw.T]
+
+    def rows(self, chosen: NDArray[np.bool_]) -> Channel:
+        """Return the channel of some of its rows."""
+        return replace(self, t_ns=self.t_ns[chosen], x=self.x[chosen])
+
+    def told(self, value: float) -> str:
+        """Return an SI value in the channel's unit."""
+        return f"{value * self.shown:.3g} {self.unit}"
+
+    def of_axis(self, axis: int) -> str:
+        """Return "gyro x"; the name alone where there is one axis."""
+        return f"{self.name} {self.axes[axis]}" if len(self.axes) > 1 else self.name
+
+
+@lru_cache(maxsize=1)
+def channels_of(log: Log) -> tuple[Channel, ...]:
+    """Return the channels of every stream that is there: gyro, accel, dvl, depth, gps, heading."""
+    noise, root_s = log.rig.imu_noise, float(np.sqrt(log.imu.period_ns * 1e-9))
+    gyro, accel = np.full(3, noise.gyro_density / root_s), np.full(3, noise.accel_density / root_s)
+    return (
+        Channel("imu", "gyro", "gyro", log.imu.t_ns, log.imu.w_WI_I, gyro, "rad/s", 1.0, XYZ),
+        Channel("imu", "accel", "accel", log.imu.t_ns, log.imu.f_I, accel, "m/s²", 1.0, XYZ),
+        *(_aiding(name, stream) for name, stream in log.streams.items() if len(stream)),
+    )
+
+
+def _aiding(name: str, stream: ReadingStream) -> Channel:
+    sigma = np.median(stream.sigma, axis=0)
+    if name == "heading":
+        x, turn, axes = np.unwrap(stream.z, axis=0), 2 * np.pi, ("",)
+        if isinstance(stream, AttitudeStream):
+            x, turn, axes = _turned(stream), 0.0, XYZ
+        quantity = "attitude" if isinstance(stream, AttitudeStream) else "heading"
+        return Channel(name, name, quantity, stream.t_ns, x, sigma, "°", 1 / DEGREE, axes, turn)
+    quantity = {"dvl": "velocity", "depth": "depth", "gps": "position"}[name]
+    unit, axes = {"dvl": ("m/s", XYZ), "depth": ("m", ("",)), "gps": ("m", ENU)}[name]
+    return Channel(name, name, quantity, stream.t_ns, stream.z, sigma, unit, 1.0, axes)
+
+
+def _turned(stream: AttitudeStream) -> Array:
+    """Return (n, 3) rad: the sum of the turns from one attitude to the next, in the sensor's axes."""
+    R_WH = stream.z.reshape(-1, 3, 3)
+    steps = Rotation.from_matrix(R_WH[:-1].transpose(0, 2, 1) @ R_WH[1:]).as_rotvec().reshape(-1, 3)
+    return np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])

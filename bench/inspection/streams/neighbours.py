@@ -1,0 +1,106 @@
+"""What a reading has that its neighbours have not: noise, and now and then an outlier.
+
+A cubic laid through the two readings before and the two after says what the one between should be. What is left has
+no motion in it that is slow against five readings, and (1 + 34/36) times the variance of white noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....datasets.state import Array, TimeArray
+from .channels import Channel
+
+MAD_TO_SIGMA = 1.4826
+NOISE_GAIN = np.sqrt(1 + 34 / 36)
+"""Standard deviation of the residual over that of the readings, where their noise is white and normal."""
+BLOCK = 100
+FEWEST = 20
+"""Residuals below which nothing is said of their spread."""
+FAR = 7.0
+"""Robust sigmas beyond which a reading is none of the noise: normal noise gets there once in 4e11."""
+FAR_FROM_CUBIC = 4.0
+STATED_FAR = 3.0
+"""An outlier within this many stated sigma is one that the stated noise explains."""
+
+
+def robust_sigma(values: Array) -> Array:
+    """Return 1.4826 × the median distance from the median, by columns; NaN rows are passed over."""
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < FEWEST:
+        return np.full(values.shape[1], np.nan)
+    return MAD_TO_SIGMA * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
+
+
+def residuals(channel: Channel) -> Array:
+    """Return (n, k): reading less cubic through its four neighbours; NaN where one of them is missing."""
+    x, t_ns, out = channel.x, channel.t_ns, np.full(channel.x.shape, np.nan)
+    if len(x) >= 5:
+        whole = (t_ns[4:] - t_ns[:-4]) * 1e-9 < 5.0 * channel.period_s
+        out[2:-2][whole] = (x[2:-2] - (4 * (x[1:-3] + x[3:-1]) - x[:-4] - x[4:]) / 6)[whole]
+    return out
+
+
+def noise_sigma(channel: Channel) -> Array:
+    """Return (k,) the standard deviation of the channel's white noise, out of its own values."""
+    return robust_sigma(residuals(channel)) / NOISE_GAIN
+
+
+def rounding_sigma(channel: Channel) -> Array:
+    """Return (k,) the standard deviation of the error by the steps that the values come in; 0 where there are none."""
+    return np.array([steps.quantum for steps in channel.steps]) / np.sqrt(12)
+
+
+def outliers(channel: Channel) -> NDArray[np.bool_]:
+    """Return which readings (n,) stand out of their neighbours on some measured axis.
+
+    A reading must be far from the median of its four neighbours by the usual spread, far from the cubic through them
+    (or it is motion), and by more than the log states. For the IMU the usual spread is that thereabouts: it shakes now
+    more, now less. An aiding sensor that is noisier for a while is wrong for a while.
+    """
+    x, none = channel.x, np.zeros(len(channel.x), bool)
+    off = residuals(channel)
+    if not np.isfinite(off).any():
+        return none
+    around = np.stack([x[:-4], x[1:-3], x[3:-1], x[4:]])
+    beside = np.full(x.shape, np.nan)
+    beside[2:-2] = x[2:-2] - np.median(around, axis=0)
+    beside[np.isnan(off)] = np.nan
+    stated = STATED_FAR * np.where(np.isfinite(channel.sigma), channel.sigma, np.inf)
+    spread_of = _spread_thereabouts if channel.stream == "imu" else robust_sigma
+    rounding = rounding_sigma(channel)
+    with np.errstate(invalid="ignore"):
+        far = (np.abs(beside) > FAR * np.maximum(spread_of(beside), rounding)) & (np.abs(beside) > stated)
+        far &= np.abs(off) > FAR_FROM_CUBIC * np.maximum(spread_of(off), rounding)
+    return np.asarray(far.any(axis=1))
+
+
+def spread_by_block(values: Array) -> tuple[TimeArray, Array]:
+    """Return where blocks of about 100 rows begin and the last ends (b + 1,), and the robust sigma of each (b, k)."""
+    blocks = max(len(values) // BLOCK, 1)
+    edges = np.linspace(0, len(values), blocks + 1).astype(np.int64)
+    longest = int(np.diff(edges).max())
+    padded = np.full((blocks, longest, values.shape[1]), np.nan)
+    row = np.arange(len(values)) - np.repeat(edges[:-1], np.diff(edges))
+    padded[np.repeat(np.arange(blocks), np.diff(edges)), row] = values
+    spread = MAD_TO_SIGMA * _nan_median(np.abs(padded - _nan_median(padded)[:, None]))
+    return edges, np.where(np.isfinite(padded).sum(axis=1) >= FEWEST, spread, np.nan)
+
+
+def _nan_median(values: Array) -> Array:
+    """Return the medians (b, k) of values (b, m, k), NaN passed over; numpy's own takes a Python call for each."""
+    count = np.isfinite(values).sum(axis=1, keepdims=True)
+    ordered = np.sort(values, axis=1)  # NaN last
+    middle = [np.take_along_axis(ordered, np.maximum((count - less) // 2, 0), axis=1) for less in (0, 1)]
+    return 0.5 * (middle[0] + middle[1])[:, 0]
+
+
+def _spread_thereabouts(values: Array) -> Array:
+    """Return (n, k): the robust sigma of a row's block, of the two beside it, or of all, whichever is largest."""
+    edges, spread = spread_by_block(values)
+    overall = robust_sigma(values)
+    spread = np.where(np.isfinite(spread), spread, overall)
+    padded = np.vstack([spread[:1], spread, spread[-1:]])
+    widest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), np.maximum(padded[2:], overall))
+    return np.repeat(widest, np.diff(edges), axis=0).reshape(values.shape)

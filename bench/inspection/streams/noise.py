@@ -1,0 +1,122 @@
+"""The noise of the aiding sensors, out of their own values, against what the log states."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....datasets.log import Log
+from ....datasets.state import Array
+from ..findings.finding import Check, Finding
+from ..findings.look import colour_of
+from .channels import Channel, channels_of
+from .neighbours import noise_sigma, residuals, rounding_sigma, spread_by_block
+from .unread import readings_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+OFF = 3.0
+"""Factor between stated and found sigma that is worth a word: nine in the weight of a reading."""
+
+UNSURE = 1.65
+"""Relative error of a robust sigma of n residuals, times √n: 1.17, and √2 more as neighbours share readings."""
+MOVING = 2.0
+"""How much larger the scatter of every second reading must be to be of motion: it holds up to 16 times more of that."""
+NOISIER, NOISY_SHARE, FEWEST_BLOCKS = 2.0, 0.05, 10
+"""A robust sigma of a hundred residuals is known to 12 %: twice the usual is eight of its own sigmas away."""
+
+
+def check_noise(log: Log) -> Check:
+    """Compare every aiding sensor's scatter against its neighbours with its stated sigma."""
+    facts, findings, ratios = {}, [], []
+    for channel in map(readings_of, channels_of(log)[2:]):
+        sigma, stated = noise_sigma(channel), channel.sigma
+        if not np.isfinite(sigma).any():
+            facts[channel.name] = "too few readings in a row"
+            continue
+        measured = np.isfinite(stated)
+        rounding = rounding_sigma(channel)
+        floor = np.maximum(sigma, rounding)
+        moving = _every_second(channel) > MOVING * sigma
+        alive = measured & (np.ptp(channel.x, axis=0) > 0)
+        facts[channel.name] = "; ".join(
+            f"{channel.of_axis(k)} {floor[k] * channel.shown:.2g}, stated {channel.told(float(stated[k]))}"
+            + (" (motion is in it)" if moving[k] else "")
+            for k in np.flatnonzero(measured).tolist()
+        )
+        ratio = np.divide(floor, stated, out=np.full(len(stated), np.nan), where=alive)
+        ratios += [(channel, k, float(ratio[k])) for k in np.flatnonzero(alive).tolist() if ratio[k] > 0]
+        findings += _off(
+            channel, floor, np.where((moving | (rounding > sigma)) & (ratio > 1), np.nan, ratio)
+        ) + _changing(log, channel, measured, rounding)
+
+    def draw(axes: Axes) -> None:
+        names = [channel.of_axis(k) for channel, k, _ in ratios]
+        for row, (channel, _, ratio) in enumerate(ratios):
+            axes.plot(ratio, row, "o", ms=5, color=colour_of(channel.stream))
+        axes.axvspan(1 / OFF, OFF, color="0.9", zorder=0)
+        axes.axvline(1, color="black", lw=0.8)
+        axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.set_xlim(min(low, 0.2), max(high, 5))
+        axes.set_yticks(range(len(names)), names)
+        axes.invert_yaxis()
+        axes.set_xlabel("scatter from reading to reading / stated sigma")
+
+    return Check("noise of the aiding sensors", facts, tuple(findings), draw if ratios else None)
+
+
+def _every_second(channel: Channel) -> Array:
+    """Return the scatter (k,) of every second reading: that of white noise is the same, that of motion much larger."""
+    return noise_sigma(channel.rows(np.arange(len(channel.x)) % 2 == 0))
+
+
+def _changing(log: Log, channel: Channel, measured: NDArray[np.bool_], rounding: Array) -> list[Finding]:
+    """Find a sensor that is much noisier for a good part of the log than usually."""
+    edges, spread = spread_by_block(residuals(channel))
+    spread = np.maximum(spread, rounding)[:, measured]
+    usual = np.median(spread[np.isfinite(spread).all(axis=1)], axis=0)
+    if np.isfinite(spread).all(axis=1).sum() < FEWEST_BLOCKS or not (usual > 0).all():
+        return []
+    times = np.nan_to_num(np.sqrt(np.mean((spread / usual) ** 2, axis=1)))
+    noisy = times > NOISIER
+    if noisy.mean() < NOISY_SHARE:
+        return []
+    runs = np.flatnonzero(np.diff(np.concatenate([[False], noisy, [False]]).astype(int))).reshape(-1, 2)
+    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    begin_s, end_s = (
+        (int(channel.t_ns[row]) - log.start_ns) * 1e-9 for row in (int(edges[first]), int(edges[last]) - 1)
+    )
+    says = (
+        f"{channel.name} is {np.median(times[noisy]):.1f} times as noisy as usual in {noisy.mean():.0%} of the log, "
+        f"longest from {begin_s:.0f} to {end_s:.0f} s: one sigma cannot be right for all of it."
+    )
+    path = f"streams.{channel.stream}"
+    mend = f"{path}.sigma (columns, row by row), or {path}.outliers.above"
+    return [Finding(channel.stream, says, mend)]
+
+
+def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
+    """Tell of the axis that is farthest off."""
+    with np.errstate(divide="ignore"):
+        off = np.where(np.isfinite(ratio) & (ratio > 0), np.abs(np.log(ratio)), 0.0)
+    k = int(np.argmax(off))
+    count = int(np.isfinite(residuals(channel)).all(axis=1).sum())
+    if off[k] <= np.log(OFF) + 2 * UNSURE / np.sqrt(count):
+        return []
+    large = ratio[k] > 1
+    how = f"{ratio[k]:.1f} times" if large else f"1/{1 / ratio[k]:.3g} of"
+    says = (
+        f"{channel.of_axis(k)} scatters from reading to reading by {channel.told(float(found[k]))}, {how} the sigma "
+        f"that is stated ({channel.told(float(channel.sigma[k]))})."
+    )
+    key = {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(channel.stream, "sigma_m")
+    values = [f"{found[j] * channel.shown:.2g}" if np.isfinite(channel.sigma[j]) else ".inf" for j in range(len(found))]
+    mend = f"streams.{channel.stream}.{key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
+    if not large:
+        says += " Right only if most of its error is slow, which does not show here."
+        mend += ", if its errors are white"
+    return [Finding(channel.stream, says, mend)]

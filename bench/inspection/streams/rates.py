@@ -1,0 +1,202 @@
+"""When readings come: rates, gaps, clusters, and how late."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ....datasets.log import Log
+from ....datasets.state import Array, TimeArray
+from ...output.figures.drawing import logarithmic
+from ..findings.finding import Check, Finding
+from ..findings.look import colour_of, thinned
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SLOWEST_IMU_HZ = 20.0
+"""A vehicle's own motion reaches 2 Hz (pitch and roll in a sea, a turn of the fins); ten samples a period show it."""
+CLUSTERED = 0.25
+"""Of the median interval: what two samples of a clock are never apart."""
+MOST_CLUSTERED = 0.01
+MOST_JITTER = 0.2
+"""Of the interval, as a standard deviation: a sample half of whose interval is guessed is no sample of a clock."""
+MOST_LOST = {"imu": 0.001}
+MOST_LOST_AIDING = 0.05
+"""A lost reading of an aiding sensor is only a reading less; a lost inertial sample is motion that nobody saw."""
+MOST_OUTSIDE = 0.01
+LONGEST_GAP_S = 5.0
+"""Tilted by half a degree, which is what accelerometers level to, inertial dead reckoning is 1 m off after 5 s."""
+LONGEST_IMU_GAP_S = 0.1
+"""Turning at 10 °/s, the vehicle has turned by a degree that no gyro saw."""
+
+
+def check_rates(log: Log) -> Check:
+    """Count each stream's readings, gaps and clusters."""
+    facts, findings = {}, []
+    times = _times(log)
+    for name, t_ns in times.items():
+        if len(t_ns) < 3:
+            facts[name] = f"{len(t_ns)} readings"
+            continue
+        interval_s = np.diff(t_ns) * 1e-9
+        period_s = float(np.median(interval_s))
+        lost = _lost(name, interval_s, period_s)
+        clustered = float(np.mean(interval_s < CLUSTERED * period_s))
+        ratio = interval_s / period_s
+        jitter = float(np.std(ratio - np.rint(ratio)))  # a lost reading is no jitter
+        at = int(np.argmax(interval_s))
+        facts[name] = (
+            f"{len(t_ns)} at {1 / period_s:.4g} Hz, jitter {jitter:.1%}, lost {lost / (len(t_ns) + lost):.2%}, "
+            f"longest gap {interval_s[at]:.3g} s at {_since(log, int(t_ns[at])):.1f} s"
+        )
+        mean_hz = (len(t_ns) - 1 + lost) / ((int(t_ns[-1]) - int(t_ns[0])) * 1e-9)
+        bunched = _clusters(name, clustered, jitter, period_s, mean_hz)
+        findings += bunched or _gaps(log, name, t_ns, lost)  # bunches have gaps between them
+    imu_hz = 1e9 / log.imu.period_ns
+    if imu_hz < SLOWEST_IMU_HZ:
+        findings.append(
+            Finding(
+                "imu",
+                f"The IMU gives {imu_hz:.3g} Hz: what moves or shakes faster than {imu_hz / 2:.3g} Hz is folded into "
+                "its samples, and coning between them is not seen.",
+                "streams.imu.noise.gyro_density and accel_density: large enough to hold that",
+            )
+        )
+
+    def draw(axes: Axes) -> None:
+        for order, (name, t_ns) in enumerate(times.items()):
+            if len(t_ns) > 2:
+                t_s, interval_s = (t_ns[1:] - log.start_ns) * 1e-9, np.diff(t_ns) * 1e-9
+                kept, look = (
+                    thinned(interval_s),
+                    {"ms": 1.5 + order, "zorder": 3 - order / 10, "color": colour_of(name)},
+                )
+                axes.plot(t_s[kept], interval_s[kept], ".", label=name, rasterized=True, **look)
+        axes.set(xlabel="time, s", ylabel="interval, s")
+        logarithmic(axes, "y")
+        axes.legend(fontsize=6, markerscale=1.5, ncols=3)
+
+    return Check("rates and gaps", facts, tuple(findings), draw if any(len(t) > 2 for t in times.values()) else None)
+
+
+def _times(log: Log) -> dict[str, TimeArray]:
+    return {"imu": log.imu.t_ns} | {name: stream.t_ns for name, stream in log.streams.items()}
+
+
+def _longest_gap_s(name: str, period_s: float) -> float:
+    """Return from where on a gap is a silence, and no number of lost readings."""
+    return max(LONGEST_IMU_GAP_S if name == "imu" else LONGEST_GAP_S, 3 * period_s)
+
+
+def _since(log: Log, t_ns: int) -> float:
+    return (t_ns - log.start_ns) * 1e-9
+
+
+def _lost(name: str, interval_s: Array, period_s: float) -> int:
+    """Return how many readings are missing between silences; two in the time of one make up for a missing one."""
+    short = interval_s[interval_s <= _longest_gap_s(name, period_s)]
+    return max(int((np.rint(short / period_s) - 1).sum()), 0)
+
+
+def _clusters(name: str, clustered: float, jitter: float, period_s: float, mean_hz: float) -> list[Finding]:
+    if clustered > MOST_CLUSTERED:
+        says = (
+            f"{name} readings come in bunches: {clustered:.1%} of their intervals are under a quarter of the median "
+            f"({period_s * 1e3:.3g} ms). They were stamped when they were received, not when they were taken."
+        )
+    elif name == "imu" and jitter > MOST_JITTER:
+        says = (
+            f"IMU intervals jitter by {jitter:.0%} of {period_s * 1e3:.3g} ms: they were stamped when they were "
+            "received, not when they were taken."
+        )
+    else:
+        return []
+    mend = (
+        f"streams.{name}.message.clock, or a time column of the device's own clock; without one, "
+        f"streams.{name}.time: {{row_rate_hz: {mean_hz:.5g}, start_s: …}} if no row is missing"
+    )
+    return [Finding(name, says, mend)]
+
+
+def _gaps(log: Log, name: str, t_ns: TimeArray, lost: int) -> list[Finding]:
+    """Find lost readings and long silences; a GPS is silent under water, so nothing is said of its gaps."""
+    if name == "gps":
+        return []
+    findings = []
+    share = lost / (len(t_ns) + lost)
+    if share > MOST_LOST.get(name, MOST_LOST_AIDING):
+        dropped = [
+            note.removeprefix(f"{name}: ") for note in log.notes if re.match(rf"{name}: \d+ rows .* dropped$", note)
+        ]
+        by_hand = f"; the description drops some ({'; '.join(dropped)})" if dropped else ""
+        findings.append(
+            Finding(
+                name, f"{share:.1%} of the {name} readings are missing: {lost}, by their rate, between others{by_hand}."
+            )
+        )
+    longest_s = _longest_gap_s(name, float(np.median(np.diff(t_ns))) * 1e-9)
+    ends_ns = [] if name == "imu" else [log.start_ns, int(log.imu.t_ns[-1])]
+    inside = t_ns[(t_ns >= log.start_ns) & (t_ns <= log.imu.t_ns[-1])]
+    edges_ns = np.sort(np.concatenate([inside, np.array(ends_ns, np.int64)]))
+    gap_s = np.diff(edges_ns) * 1e-9
+    long = np.flatnonzero(gap_s > longest_s)
+    if len(long):
+        at = long[np.argmax(gap_s[long])]
+        count = "one silence" if len(long) == 1 else f"{len(long)} silences"
+        findings.append(
+            Finding(
+                name,
+                f"{name} has {count} of more than {longest_s:g} s; the longest is {gap_s[at]:.3g} s, "
+                f"from {_since(log, int(edges_ns[at])):.1f} s after the start.",
+            )
+        )
+    outside = len(t_ns) - len(inside)
+    if outside > MOST_OUTSIDE * len(t_ns):
+        findings.append(
+            Finding(
+                name,
+                f"{outside} of {len(t_ns)} {name} readings lie before or after the IMU's time and are of no use.",
+                f"streams.{name}.time.clock_offset_s, if the two clocks differ",
+            )
+        )
+    return findings
+
+
+def check_delays(log: Log) -> Check:
+    """Say how long each stream's readings were on their way, and which overtook which."""
+    facts, findings = {}, []
+    late = {name: np.asarray((s.received_ns - s.t_ns) * 1e-9, float) for name, s in log.streams.items() if len(s) > 1}
+    for name, late_s in late.items():
+        if not late_s.any():
+            facts[name] = "received when it was true, or nobody noted when"
+            continue
+        stream = log.streams[name]
+        overtaken = int(
+            np.count_nonzero(stream.received_ns[:-1] > np.minimum.accumulate(stream.received_ns[::-1])[-2::-1])
+        )
+        median_s, period_s = float(np.median(late_s)), float(np.median(np.diff(stream.t_ns))) * 1e-9
+        facts[name] = f"median {median_s:.3g} s, at most {late_s.max():.3g} s, {overtaken} overtaken by a later one"
+        if median_s > period_s or overtaken:
+            order = f", and {overtaken} of {len(late_s)} were overtaken by a later one" if overtaken else ""
+            findings.append(
+                Finding(
+                    name,
+                    f"{name} readings come {median_s:.3g} s after they were true (at most {late_s.max():.3g} s), their "
+                    f"interval being {period_s:.3g} s{order}: a filter that cannot go back uses them late.",
+                    f"streams.{name}.time.received and .delay_s, if this is not so",
+                )
+            )
+
+    def draw(axes: Axes) -> None:
+        for name, late_s in late.items():
+            if late_s.any():
+                t_s, kept = (log.streams[name].t_ns - log.start_ns) * 1e-9, thinned(late_s)
+                axes.plot(t_s[kept], late_s[kept], ".", ms=2, color=colour_of(name), label=name, rasterized=True)
+        axes.set(xlabel="time, s", ylabel="received after it was true, s")
+        axes.set_ylim(bottom=0)
+        axes.legend(fontsize=6, markerscale=3)
+
+    return Check("delays", facts, tuple(findings), draw if any(late_s.any() for late_s in late.values()) else None)

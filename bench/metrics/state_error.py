@@ -1,0 +1,184 @@
+"""Errors of the whole state, heading to biases, and whether the covariance owns up to them: NEES and coverage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, TimeArray
+from ...datasets.trajectory import Trajectory
+from .association import ScoreError, associate
+from .pose_error import check_finite, heading_roll_pitch, rmse, rotation_vector, wrapped
+
+Block: TypeAlias = Literal["position", "attitude", "velocity", "biases", "all"]
+BLOCKS: dict[Block, slice] = {
+    "position": POSITION,
+    "attitude": THETA,
+    "velocity": VELOCITY,
+    "biases": slice(ACCEL_BIAS.start, GYRO_BIAS.stop),
+    "all": slice(0, DIM),
+}
+DOF: dict[Block, int] = {block: of.stop - of.start for block, of in BLOCKS.items()}
+
+
+@dataclass(frozen=True)
+class StateErrors:
+    """RMSE of each part of the state over n poses; vectors by their norm; None where truth or estimate know it not."""
+
+    heading_deg: float | None
+    roll_deg: float | None
+    pitch_deg: float | None
+    velocity_m_s: float | None
+    depth_m: float | None
+    accel_bias_m_s2: float | None
+    gyro_bias_rad_s: float | None
+    n: int
+
+
+def state_errors(truth: Trajectory, estimate: Trajectory, tolerance_ns: int = 0) -> StateErrors:
+    """RMSE of heading, roll, pitch (R_WB = Rz Ry Rx, differences wrapped), velocity, depth and biases; unaligned.
+
+    Args:
+        truth, estimate, tolerance_ns: as for `ate`. Rows in which a part is NaN are left out of that part.
+
+    Raises:
+        ScoreError: nothing to compare, or the estimate diverged.
+    """
+    truth, estimate = associate(truth, estimate, tolerance_ns)
+    check_finite(estimate)
+    angles = np.degrees(wrapped(heading_roll_pitch(estimate.R_WB) - heading_roll_pitch(truth.R_WB)))
+    return StateErrors(
+        heading_deg=rmse(angles[:, 0]),
+        roll_deg=rmse(angles[:, 1]),
+        pitch_deg=rmse(angles[:, 2]),
+        velocity_m_s=rmse(_difference(truth.v_WB_W, estimate.v_WB_W, len(truth))),
+        depth_m=rmse(truth.p_WB_W[:, 2] - estimate.p_WB_W[:, 2]),
+        accel_bias_m_s2=rmse(_difference(truth.b_a, estimate.b_a, len(truth))),
+        gyro_bias_rad_s=rmse(_difference(truth.b_g, estimate.b_g, len(truth))),
+        n=len(truth),
+    )
+
+
+def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tolerance_ns: int = 0) -> Array:
+    """Normalised estimation error squared, eᵀ P⁻¹ e, with estimate ⊕ e = truth; of an honest estimate, χ² on average.
+
+    Args:
+        truth, estimate, tolerance_ns: as for `ate`; nothing is aligned.
+        block: "position", "attitude", "velocity" (3 degrees of freedom each), "biases" (6) or "all" (15).
+
+    Returns:
+        (n,) for the n associated rows; NaN where P or the truth is.
+
+    Raises:
+        ScoreError: no such block, the estimate has no P, part of the block is unknown in every row, or a P is not
+            positive definite.
+
+    Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2; e in the coordinates of `fathom.datasets.state`.
+    """
+    e, P, t_ns = _judged(truth, estimate, block, tolerance_ns)
+    known = ~(np.isnan(e).any(axis=1) | np.isnan(P).any(axis=(1, 2)))
+    score = np.full(len(e), np.nan)
+    try:
+        L = np.linalg.cholesky(P[known]).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:
+        row = int(np.flatnonzero(known)[np.argmin(np.linalg.eigvalsh(P[known])[:, 0])])
+        raise ScoreError(f"nees: P of {block!r} is not positive definite at {t_ns[row]} ns") from None
+    score[known] = (_solve_lower(L, e[known]) ** 2).sum(axis=1)  # L w = e, so eᵀ P⁻¹ e = wᵀ w
+    return score
+
+
+def _solve_lower(L: Array, e: Array) -> Array:
+    """Return w (n, k) with L w = e, row by row of e, for lower triangles L (n, k, k)."""
+    w = np.empty_like(e)
+    for i in range(e.shape[1]):
+        w[:, i] = (e[:, i] - (L[:, i, :i] * w[:, :i]).sum(axis=1)) / L[:, i, i]
+    return w
+
+
+def coverage(
+    truth: Trajectory, estimate: Trajectory, block: Block = "position", tolerance_ns: int = 0
+) -> tuple[float, float, float]:
+    """Return the share of the errors' components that lie within 1, 2 and 3 of their own σ, the roots of P's diagonal.
+
+    Of an honest Gaussian estimate 0.6827, 0.9545 and 0.9973 on average, whatever the correlations. Rows and components
+    where P or the truth is NaN are left out.
+
+    Args:
+        truth, estimate, block, tolerance_ns: as for `nees`.
+
+    Raises:
+        ScoreError: as `nees`, but for a P that is not positive definite; or P is NaN in every row.
+    """
+    e, P, _ = _judged(truth, estimate, block, tolerance_ns)
+    variance = np.einsum("nii->ni", P)
+    known = ~(np.isnan(e) | np.isnan(variance))
+    if not known.any():
+        raise ScoreError("coverage: no row has a covariance")
+    squared, bound = e[known] ** 2, variance[known]
+    one, two, three = (float((squared <= k**2 * bound).mean()) for k in (1, 2, 3))
+    return one, two, three
+
+
+def not_positive(estimate: Trajectory) -> TimeArray:
+    """Return the rows whose P is not positive definite, (k,); rows of NaN do not count.
+
+    Raises:
+        ScoreError: the estimate has no P.
+    """
+    if estimate.P is None:
+        raise ScoreError("the estimate has no covariances; ask the estimator for them")
+    rows = np.flatnonzero(~np.isnan(estimate.P).any(axis=(1, 2)))
+    try:
+        np.linalg.cholesky(estimate.P[rows])
+    except np.linalg.LinAlgError:
+        return np.array([row for row in rows if not _has_root(estimate.P[row])], np.int64)
+    return np.zeros(0, np.int64)
+
+
+def _has_root(P: Array) -> bool:
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns: int) -> tuple[Array, Array, TimeArray]:
+    """Return the block's errors (n, k), covariances (n, k, k) and times (n,), of the associated rows.
+
+    Raises:
+        ScoreError: no such block, the estimate has no P, or part of the block is unknown in every row.
+    """
+    if block not in BLOCKS:
+        raise ScoreError(f"nees: no block {block!r}; there are {', '.join(BLOCKS)}")
+    truth, estimate = associate(truth, estimate, tolerance_ns)
+    if estimate.P is None:
+        raise ScoreError("nees: the estimate has no covariances; ask the estimator for them")
+    check_finite(estimate)
+    of = BLOCKS[block]
+    e = error_state(truth, estimate)[:, of]
+    unknown = np.isnan(e).all(axis=0)
+    if unknown.any():
+        raise ScoreError(
+            f"nees: {np.count_nonzero(unknown)} of the {unknown.size} components of {block!r} have no known error"
+        )
+    return e, estimate.P[:, of, of], estimate.t_ns
+
+
+def error_state(truth: Trajectory, estimate: Trajectory) -> Array:
+    """Return e (n, 15) with estimate ⊕ e = truth, of associated trajectories; NaN where something is unknown."""
+    n = len(truth)
+    e = np.empty((n, DIM))
+    e[:, THETA] = rotation_vector(estimate.R_WB.transpose(0, 2, 1) @ truth.R_WB)
+    e[:, POSITION] = truth.p_WB_W - estimate.p_WB_W
+    e[:, VELOCITY] = _difference(estimate.v_WB_W, truth.v_WB_W, n)
+    e[:, ACCEL_BIAS] = _difference(estimate.b_a, truth.b_a, n)
+    e[:, GYRO_BIAS] = _difference(estimate.b_g, truth.b_g, n)
+    return e
+
+
+def _difference(x: Array | None, y: Array | None, n: int) -> Array:
+    """Return y − x (n, 3), NaN where either is unknown."""
+    return np.full((n, 3), np.nan) if x is None or y is None else y - x

@@ -1,0 +1,98 @@
+"""Is the error as large as the covariance says? NEES over time, averaged over seeds, with the intervals it is due."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ...metrics import BLOCKS, DOF
+from ...metrics.consistency import Average, anees_of, interval
+from ...results.summary import Record, groups
+from .drawing import (
+    TEXT_PT,
+    TITLE_PT,
+    WIDTH_IN,
+    Look,
+    empty_figure,
+    legend_below,
+    logarithmic,
+    look_handle,
+    title_above,
+)
+
+POINTWISE = 0.95
+FITS_A_PANEL = 12
+"""So many lines of a legend fit where a sixth panel would be."""
+
+
+def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Figure:
+    """Draw the NEES of each block, averaged over the seeds, at the fixed times of one log, with two bands of honesty.
+
+    The dark band holds 95 % of an honest estimator's points, each time by itself; the pale one 99.9 % of honest lines,
+    all times of a line together, see `consistency`. Both are those of the most seeds that any estimator has, one
+    included. Hindsight is open and dotted.
+
+    Args:
+        rows: of one log.
+        looks: by label.
+        title: the log's name.
+    """
+    done = [row for row in rows if row["status"] == "done"]
+    lines = {key: anees_of([row["nees_at"] for row in of]) for key, of in groups(done, "label", "output").items()}
+    figure, panels = empty_figure(2, 3, WIDTH_IN, 4.0)
+    for block, axes in zip(BLOCKS, panels, strict=False):
+        averages = {key: of_line[block] for key, of_line in lines.items() if block in of_line}
+        for (label, output), average in averages.items():
+            online, look = output == "online", looks[label]
+            axes.plot(
+                average.t_s,
+                average.value,
+                color=look.colour,
+                linestyle=look.dash if online else ":",
+                linewidth=0.8,
+                marker=look.marker,
+                markersize=3.5,
+                markeredgewidth=0.7,
+                markerfacecolor=look.colour if online else "white",
+            )
+        axes.axhline(1, color="black", linewidth=0.4)
+        if averages:
+            _draw_bands(axes, max(averages.values(), key=lambda average: (average.runs.max(), len(average))))
+        axes.set_title(f"{block}, {DOF[block]} dof", fontsize=TITLE_PT)
+    for axes in panels[3:5]:
+        axes.set_xlabel("time (s)")
+    panels[2].set_xlabel("time (s)")
+    panels[2].tick_params(labelbottom=True)
+    for axes in panels[::3]:
+        axes.set_ylabel("NEES / dof")
+    runs = max((int(average.runs.max()) for of_line in lines.values() for average in of_line.values()), default=0)
+    over = f"mean of {runs} seeds" if runs > 1 else "one run"
+    title_above(figure, f"{title}: normalised estimation error squared (NEES) over its degrees of freedom, {over}")
+    handles = [
+        look_handle(label, looks[label]) for label in dict.fromkeys(label for (label, _), of in lines.items() if of)
+    ]
+    if any(output == "hindsight" for (_, output), of_line in lines.items() if of_line):
+        dotted = {"marker": "o", "markersize": 3.5, "markerfacecolor": "white", "linestyle": ":", "linewidth": 0.8}
+        handles.append(Line2D([], [], color="black", label="with hindsight", **dotted))
+    handles.append(Line2D([], [], color="black", alpha=0.25, linewidth=6, label="95 % of honest points"))
+    handles.append(Line2D([], [], color="black", alpha=0.1, linewidth=6, label="99.9 % of honest lines"))
+    panels[5].axis("off")
+    if len(handles) <= FITS_A_PANEL and max(len(str(handle.get_label())) for handle in handles) < 32:
+        panels[5].legend(handles=handles, loc="center", frameon=False, fontsize=TEXT_PT)
+    else:
+        legend_below(figure, handles)
+    return figure
+
+
+def _draw_bands(axes: Axes, average: Average) -> None:
+    """Draw where an honest average lies; the dark band and the points set the scale."""
+    low, high = interval(np.array([average.dof.max()]), POINTWISE)
+    axes.axhspan(float(low[0]), float(high[0]), color="black", alpha=0.15, linewidth=0)
+    logarithmic(axes, "y")
+    limits = axes.get_ylim()
+    axes.axhspan(average.low.min(), average.high.max(), color="black", alpha=0.1, linewidth=0)
+    axes.set_ylim(limits)

@@ -1,0 +1,196 @@
+"""The page: what an experiment found, in the order in which a reader asks, in one file without network."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+import pandas as pd
+
+from ...errors import ExperimentError
+from ...results.store import load_runs
+from ...results.summary import Record, groups, records, summarise
+from ..figures.drawing import looks_of
+from ..tables.table import mostly_outside, not_positive
+from . import curves, runs, sheets
+from .results import differences_of, in_order, kept_plan
+from .tracks import Drawn, draw_all
+
+HERE = Path(__file__).parent
+STARTING_LETTERS = 8
+"""How many letters of a run's identity the page shows."""
+
+
+class NoExtraError(ExperimentError):
+    """The packages that the page is made with are not installed."""
+
+
+def report(folder: Path, file: Path | None = None) -> Path:
+    """Write the page of a result folder, from what lies there, and return the file.
+
+    Args:
+        folder: with the runs.sqlite of an experiment.
+        file: where the page goes; folder/report.html without.
+
+    Raises:
+        ExperimentError: no store there, an empty one, or the page cannot be written; NoExtraError without the extra.
+    """
+    check_extra()
+    rows = load_runs(folder)
+    if rows.empty:
+        raise ExperimentError(f"{folder / 'runs.sqlite'}: there is no run in it; `fathom run` makes them")
+    return write_report(in_order(rows, folder), folder, differences_of(folder), file)
+
+
+def write_report(
+    rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = (), file: Path | None = None
+) -> Path:
+    """Write the page of these rows and return the file.
+
+    Args:
+        rows: of the store.
+        folder: the experiment's, with its trajectories and its `kept_plan`.
+        differences: what `paired` found.
+        file: where the page goes; folder/report.html without.
+
+    Raises:
+        ExperimentError: it cannot be written; NoExtraError where the extra is not installed.
+    """
+    text = render(rows, folder, differences)
+    file = folder / "report.html" if file is None else file
+    unfinished = file.with_name(f"{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        unfinished.write_text(text, encoding="utf-8")
+        unfinished.replace(file)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise ExperimentError(f"{file}: cannot be written ({error.strerror}); choose another place by -o") from None
+    return file
+
+
+def check_extra() -> None:
+    """Raise NoExtraError where the extra is not installed."""
+    try:
+        import jinja2  # noqa: F401
+        import plotly  # noqa: F401
+    except ImportError as error:
+        raise NoExtraError(f"{error}; the report needs an extra: pip install 'fathom-bench[report]'") from None
+
+
+def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> str:
+    """Return the page's HTML.
+
+    Raises:
+        NoExtraError: the extra is not installed.
+    """
+    check_extra()
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+
+    every, summary = records(rows), summarise(rows)
+    by_log = {log: of for (log,), of in groups(summary, "log").items()}
+    done = _done(every)
+    drawn = draw_all(every, folder / "trajectories")
+    logs = [
+        {
+            "name": log,
+            "drawn": drawn.get(log, Drawn()),
+            "seeds": list(drawn[log].seeds) if log in drawn else [],
+            "truth": any(row["truth_kind"] is not None for row in of),
+            "aligned": next((row["align"] for row in of if row["align"]), "none"),
+            "anees": curves.anees([row for row in every if row["log"] == log]),
+            "costs": curves.costs(of),
+        }
+        for log, of in by_log.items()
+    ]
+    name = str(every[0]["experiment"] or folder.name)
+    plan, again = kept_plan(folder, name)
+    templates = Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    templates.filters["ordinal"] = ordinal
+    return templates.get_template("page.html").render(
+        name=name,
+        description="" if plan is None else plan.description,
+        again=None if again is None else quote(again),
+        folder=quote(str(folder)),
+        example=next(((row["identity"] or "")[:STARTING_LETTERS] for row in every if row["identity"]), None),
+        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        facts=runs.facts(every),
+        failures=runs.failures(every),
+        warnings=[*mostly_outside(rows), *not_positive(summary), *_mixed(every), *_missing(drawn)],
+        accuracy=[sheets.accuracy(of, done) for of in by_log.values()],
+        over_floor=_there(map(sheets.over_floor, by_log.values())),
+        differences=sheets.differences(differences),
+        honesty=_there(map(sheets.honesty, by_log.values())),
+        late=_there(map(sheets.late_or_out, by_log.values())),
+        costs=_there(map(sheets.cost, by_log.values())),
+        logs=logs,
+        runs=sheets.runs(every),
+        environments=runs.environments(every),
+        style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
+        scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in ("tables.js", "figures.js")],
+        plotly=Markup(get_plotlyjs()),
+        embedded=embedded,
+        details=runs.details(every),
+        page={
+            "looks": curves.looks(looks_of([label for (label,) in groups(every, "label")])),
+            "logs": [{key: log[key] for key in ("name", "truth", "aligned", "anees", "costs")} for log in logs],
+        },
+    )  # fmt: skip
+
+
+def ordinal(k: int) -> str:
+    """Return "2nd", "3rd", "4th", "11th", "22nd"."""
+    suffix = "th" if k % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(k % 10, "th")
+    return f"{k}{suffix}"
+
+
+def embedded(value: Any) -> Any:
+    """Return a value as JSON that no text in it can break out of a script element with; what is not finite is null."""
+    from markupsafe import Markup
+
+    text = json.dumps(_finite(value), separators=(",", ":"))
+    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _done(every: Sequence[Record]) -> sheets.Done:
+    outputs = groups(every, "log", "label", "output")
+    return {key: [row for row in of if row["status"] == "done"] for key, of in outputs.items()}
+
+
+def _there(found: Iterable[sheets.Sheet | None]) -> list[sheets.Sheet]:
+    return [sheet for sheet in found if sheet is not None]
+
+
+def _mixed(every: Sequence[Record]) -> list[str]:
+    """Say where rows are not of one make."""
+    what = {"machine": "machines: timings from different ones are not to be compared", "versions": "sets of versions"}
+    kinds = {column: len({row[column] for row in every}) for column in what}
+    return [f"these runs were made with {n} {what[column]}" for column, n in kinds.items() if n > 1]
+
+
+def _missing(drawn: dict[str, Drawn]) -> list[str]:
+    """Say which trajectories cannot be drawn."""
+    lines = []
+    for log, of in drawn.items():
+        if of.missing:
+            more = "" if len(of.missing) == 1 else f", and {len(of.missing) - 1} more"
+            lines.append(f"{log}: trajectories are missing from the figures: {of.missing[0]}{more}")
+    return lines

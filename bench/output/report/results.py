@@ -1,0 +1,96 @@
+"""What lies in a result folder beside its runs, and how a folder is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import yaml
+
+from ....datasets.errors import nearest
+from ...errors import ExperimentError
+from ...experiment.plan import Experiment, plain, shipped_experiments
+from ...results.summary import Record, records
+
+PLAN = "experiment.yaml"
+NAMES = ("log", "label", "output", "baseline_log", "baseline_label", "baseline_output", "score")
+"""Columns of paired.csv that are text, whatever it looks like."""
+
+
+def find_result(name: str, results: Path = Path("results")) -> Path:
+    """Return the folder of a result: that folder itself, or an experiment's name under `results`.
+
+    Raises:
+        ExperimentError: neither; names the nearest known.
+    """
+    for folder in (Path(name), results / name):
+        try:
+            if (folder / "runs.sqlite").is_file():
+                return folder
+        except (OSError, ValueError):  # too long for a name, or no text for one
+            continue
+    known = sorted(path.parent.name for path in results.glob("*/runs.sqlite"))
+    found = f"(in {results}: {', '.join(known)})" if known else f"(none in {results}; `fathom run` makes them)"
+    raise ExperimentError(f"{name}: no such result{nearest(Path(name).name, known)} {found}")
+
+
+def keep_plan(plan: Experiment, folder: Path) -> None:
+    """Write an experiment beside its runs, every estimator and log by itself, such that `fathom run` takes it.
+
+    Raises:
+        ExperimentError: it cannot be written.
+    """
+    text = yaml.safe_dump(plain(plan), sort_keys=False, allow_unicode=True, width=120)
+    try:
+        (folder / PLAN).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ExperimentError(f"{folder / PLAN}: cannot be written ({error.strerror})") from None
+
+
+def kept_plan(folder: Path, name: str) -> tuple[Experiment | None, str | None]:
+    """Return what was asked, and what `fathom run` calls it: what `keep_plan` left, else the shipped one of this name.
+
+    None, None where nobody knows.
+    """
+    kept, shipped = _load(folder / PLAN), _load(name) if name in shipped_experiments() else None
+    if shipped is not None and (kept is None or plain(kept) == plain(shipped)):
+        return shipped, name
+    return (None, None) if kept is None else (kept, str(folder / PLAN))
+
+
+def _load(source: str | Path) -> Experiment | None:
+    """Return an experiment; None where there is none, or another version wrote it."""
+    try:
+        return Experiment.load(source)
+    except ExperimentError:
+        return None
+
+
+def in_order(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
+    """Return the rows of a store in the order of the experiment's logs, estimators and seeds, as figures colour them.
+
+    What an earlier experiment of this name left, with other labels or logs, goes last.
+    """
+    plan, _ = kept_plan(folder, str(rows["experiment"].iloc[0]))
+    known = ([log.name for log in plan.logs], [each.label for each in plan.estimators]) if plan else ([], [])
+    places = {
+        column: {name: place for place, name in enumerate(dict.fromkeys([*first, *rows[column]]))}
+        for column, first in zip(("log", "label"), known, strict=True)
+    }
+    place = pd.DataFrame({column: [of[name] for name in rows[column]] for column, of in places.items()}, rows.index)
+    return rows.loc[place.assign(seed=rows["seed"]).sort_values(["log", "seed", "label"], kind="stable").index]
+
+
+def differences_of(folder: Path) -> list[Record]:
+    """Return what `fathom run` left of `paired` in a result folder; nothing where there is none.
+
+    Raises:
+        ExperimentError: the file cannot be read.
+    """
+    path = folder / "paired.csv"
+    if not path.is_file():
+        return []
+    try:
+        return records(pd.read_csv(path, dtype=dict.fromkeys(NAMES, str), keep_default_na=False, na_values=[""]))
+    except (OSError, ValueError) as error:
+        raise ExperimentError(f"{path}: cannot be read ({' '.join(str(error).split())})") from None

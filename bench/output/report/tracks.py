@@ -1,0 +1,156 @@
+"""What the page draws of trajectories: of every log some seeds, of every track every k-th pose."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pyarrow.parquet import read_metadata
+
+from ....datasets.errors import one_line
+from ....datasets.state import POSITION, Array
+from ...results.summary import Record, groups
+from ..figures.track import Track, tracks_of
+from .sheets import lookahead
+
+POSES = 200_000
+"""How many poses a page may hold; one is 48 bytes of it."""
+OF_A_TRACK = (2000, 1000, 500, 200)
+"""How many poses of one track are drawn: the first for which one seed of each log has room, and the last anyhow."""
+MOST_SEEDS = 10
+"""How many seeds of a log are drawn at most: nobody looks at hundreds, and reading them takes its time."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn of one log.
+
+    Attributes:
+        seeds: what the page's script is given, by seed; None for a recorded log.
+        every: one pose in so many is shown.
+        poses: how many the longest track has.
+        left_out: how many seeds are not drawn.
+        missing: trajectories that rows speak of and that cannot be read, and why.
+    """
+
+    seeds: dict[int | None, Any] = field(default_factory=dict)
+    every: int = 1
+    poses: int = 0
+    left_out: int = 0
+    missing: list[str] = field(default_factory=list)
+
+
+def draw_all(rows: Sequence[Record], folder: Path) -> dict[str, Drawn]:
+    """Read of each log as many seeds as the page has room for: first those with a run that did not come to its end.
+
+    Args:
+        rows: of the store.
+        folder: where its trajectories are.
+    """
+    logs = {log: groups(of, "seed") for (log,), of in groups(filter(_is_saved, rows), "log").items()}
+    lengths = [_poses(folder / row["trajectory"]) for of_log in logs.values() for row in next(iter(of_log.values()))]
+    most = next((m for m in OF_A_TRACK if sum(min(m, n) for n in lengths) <= POSES), OF_A_TRACK[-1])
+    seeds = min(MOST_SEEDS, max(1, POSES // max(1, sum(min(most, n) for n in lengths))))
+    return {
+        log: _draw({seed: of for (seed,), of in of_log.items()}, folder, most, seeds) for log, of_log in logs.items()
+    }
+
+
+def _is_saved(row: Record) -> bool:
+    return row["trajectory"] is not None
+
+
+def _poses(path: Path) -> int:
+    """Return how many poses a file holds; 0 where it cannot be read."""
+    try:
+        return read_metadata(path).num_rows
+    except (OSError, ValueError):
+        return 0
+
+
+def _draw(by_seed: Mapping[int | None, Sequence[Record]], folder: Path, most: int, seeds: int) -> Drawn:
+    troubled = sorted(by_seed, key=lambda seed: (all(row["status"] == "done" for row in by_seed[seed]), seed or 0))
+    tracks: dict[int | None, list[tuple[Record, Track]]] = {}
+    missing: list[str] = []
+    for seed in sorted(troubled[:seeds], key=lambda seed: seed or 0):
+        read = [(row, _read(row, folder, missing)) for row in by_seed[seed]]
+        found = [(row, track) for row, track in read if track is not None]
+        if found:
+            tracks[None if seed is None else int(seed)] = found
+    poses = max((len(track.estimate) for of in tracks.values() for _, track in of), default=0)
+    every = -(-poses // most) or 1
+    blocks = {seed: _block(of, every) for seed, of in tracks.items()}
+    return Drawn(blocks, every, poses, len(by_seed) - len(troubled[:seeds]), missing)
+
+
+def _read(row: Record, folder: Path, missing: list[str]) -> Track | None:
+    """Return the track of a row; None where there is none to compare, or after adding to `missing` what is wrong."""
+    for name in (row["trajectory"], row["truth_trajectory"]):
+        if name is not None and not (folder / name).is_file():
+            missing.append(f"{name}: not there")
+            return None
+    try:
+        tracks, _ = tracks_of([row], folder)
+    except (OSError, ValueError, KeyError) as error:  # a file that was cut off, or is none of ours
+        missing.append(f"{row['trajectory']}: {one_line(error)}")
+        return None
+    return tracks[0] if tracks else None
+
+
+def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]:
+    """Return one seed's tracks, one pose in `every`, as the script reads them: m and s, each array as base64."""
+    start_ns = min(int(track.estimate.t_ns[0]) for _, track in tracks)
+    truths = [track.truth for _, track in tracks if track.truth is not None]
+    longest = max(truths, key=len, default=None)
+    return {
+        "truth": None if longest is None else _coordinates(longest.p_WB_W[::every, :2]),
+        "tracks": [
+            {
+                "label": track.label,
+                "output": track.output,
+                "ahead": lookahead(row),
+                "near": _is_near(track),
+                "t": floats(1e-9 * (track.estimate.t_ns[::every] - start_ns).astype(float)),
+                "p": _coordinates(track.estimate.p_WB_W[::every, :2]),
+                "error": _errors(track, every),
+                "sigma": _sigmas(track, every),
+            }
+            for row, track in tracks
+        ],
+    }
+
+
+def _is_near(track: Track) -> bool:
+    """Whether a track keeps within the truth's own extent of it: one that got lost does not set a figure's scale."""
+    if track.truth is None:
+        return True
+    error_m = (track.estimate.p_WB_W - track.truth.p_WB_W)[:, :2]
+    return bool(np.nanmax(np.abs(error_m), initial=0.0) < max(np.ptp(track.truth.p_WB_W[:, :2], axis=0).max(), 1.0))
+
+
+def _errors(track: Track, every: int) -> list[str] | None:
+    if track.truth is None:
+        return None
+    return _coordinates(track.estimate.p_WB_W[::every] - track.truth.p_WB_W[::every])
+
+
+def _sigmas(track: Track, every: int) -> list[str] | None:
+    """Return σ by axis; None where there is no covariance, or it is in other axes than the aligned error."""
+    if track.align != "none" or track.estimate.P is None or track.truth is None:
+        return None
+    variance = np.diagonal(track.estimate.P[::every, POSITION, POSITION], axis1=1, axis2=2)
+    return _coordinates(np.sqrt(variance.clip(min=0)))
+
+
+def _coordinates(values: Array) -> list[str]:
+    return [floats(column) for column in np.asarray(values).T]
+
+
+def floats(values: Array) -> str:
+    """Return numbers as the base64 of little-endian 32-bit floats: to a millimetre at 10 km."""
+    with np.errstate(over="ignore"):
+        return b64encode(np.asarray(values, "<f4").tobytes()).decode("ascii")

@@ -1,0 +1,132 @@
+"""What came of running stored runs again, on the terminal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from statistics import median
+from textwrap import shorten
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from ...execution.reproduce import Again, Difference, Value, changed_facts
+from . import terminal
+
+ABSENT = "–"
+WIDEST = 44
+"""Of a value in a cell."""
+HEADINGS = ("said", "runs", "verdict", "then", "now", "difference", "relative")
+
+ROUNDING = (
+    "versions or kind of machine differ, so sums are rounded otherwise: expect relative differences of some 1e-10, "
+    "more only where they tip a threshold (a gate, a relinearisation); see docs/reproduce.md"
+)
+CODE = "the code is not what it was: differences of any size may be meant; the commits between tell"
+SAME = "code, versions and kind of machine are the same: so are the scores, bit for bit, or something is wrong"
+
+
+def print_reproduction(every: Sequence[Again], console: Console | None = None) -> None:
+    """Print what is not as it was, a verdict per estimator and output, what could not be run, and the sum of it.
+
+    Of a single run every score that differs is listed; of several the one that differs most in each group.
+    """
+    console = console or terminal.console()
+    run = [again for again in every if again.skipped is None]
+    if run:
+        _print_facts(run, console)
+        console.print(_verdicts(run, most=None if len(run) == 1 else 1))
+    for line in _sentences(every):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _print_facts(run: Sequence[Again], console: Console) -> None:
+    """Print what of code, versions and machine is not as it was, and what that lets one expect."""
+    counts = Counter((fact.name, fact.then, fact.now) for again in run for fact in changed_facts(again.stored))
+    if counts:
+        table = _empty("made with", ("then", "now", "runs"))
+        for (name, then, now), n in counts.items():
+            values = [_short_hash(each) if name in ("commit", "code") else str(each or ABSENT) for each in (then, now)]
+            table.add_row(name, *values, f"{n}/{len(run)}")
+        console.print(table)
+        console.print()
+    names = {name for name, _, _ in counts} - {"commit"}
+    sentence = CODE if "code" in names else ROUNDING if names else SAME
+    console.print(sentence, highlight=False, markup=False, soft_wrap=True)
+    console.print()
+
+
+def _verdicts(run: Sequence[Again], most: int | None) -> Table:
+    """Return a row per log, label and output where all is identical, else one for each of the `most` worst scores."""
+    table = _empty("log / label", HEADINGS)
+    grouped: dict[tuple[str, str], list[Again]] = {}
+    for again in sorted(run, key=lambda again: again.stored.group):
+        for output in again.differences:
+            grouped.setdefault((again.stored.group, output), []).append(again)
+    for (group, output), of_group in grouped.items():
+        same = sum(not again.differences[output] for again in of_group)
+        worst = sorted(
+            ((each, again) for again in of_group for each in again.differences[output]),
+            key=lambda pair: -pair[0].relative,
+        )
+        cells = [Text(group), output, f"{same}/{len(of_group)}"]
+        if not worst:
+            table.add_row(*cells, Text("identical", "green"))
+        for each, again in _listed(worst)[:most]:
+            seed = "" if most is None or again.stored.first["seed"] is None else f" (seed {again.stored.first['seed']})"
+            table.add_row(*cells, Text(f"{each.name}{seed}", "red"), *_difference(each))
+            cells = ["", "", ""]
+    return table
+
+
+def _listed(worst: Sequence[tuple[Difference, Again]]) -> list[tuple[Difference, Again]]:
+    """Return the differences but for those of the NEES at fixed times, of which the first is enough."""
+    at_times = [pair for pair in worst if pair[0].name.startswith("nees_at.")]
+    return [pair for pair in worst if pair not in at_times[1:]]
+
+
+def _difference(each: Difference) -> list[str]:
+    if each.absolute is None:
+        return [_text(each.then), _text(each.now), "", ""]
+    return [_text(each.then), _text(each.now), f"{each.absolute:+.1e}", f"{each.relative:.1e}"]
+
+
+def _sentences(every: Sequence[Again]) -> list[str]:
+    """Return what is to be said of single runs, and the sum."""
+    told = [(remark, again.stored.name) for again in every for remark in again.remarks]
+    told += [(f"not run again: {again.skipped}", again.stored.name) for again in every if again.skipped is not None]
+    names: dict[str, list[str]] = {}
+    for sentence, name in told:
+        names.setdefault(sentence, []).append(name)
+    lines = [f"{_several(of)}: {sentence}" for sentence, of in names.items()]
+    run = [again for again in every if again.skipped is None]
+    ratios = [again.time_ratio for again in run if again.time_ratio is not None]
+    took = f"; computing took {median(ratios):.2f} times as long (median), which is not compared" if ratios else ""
+    same = sum(again.is_identical for again in run)
+    lines.append(f"{same} of {len(run)} runs came out identical, bit for bit{took}")
+    return lines
+
+
+def _several(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def _empty(first: str, headings: Sequence[str]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column(first, overflow="fold", min_width=14)
+    for heading in headings:
+        table.add_column(heading, overflow="fold", justify="left" if heading in ("said", "verdict") else "right")
+    return table
+
+
+def _short_hash(value: Value) -> str:
+    digest, *edited = str(value or ABSENT).split("-", 1)
+    return "-".join([digest[:12], *edited])
+
+
+def _text(value: Value) -> str:
+    if value is None:
+        return ABSENT
+    return shorten(value, WIDEST, placeholder="…") if isinstance(value, str) else f"{value:.12g}"

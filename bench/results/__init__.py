@@ -1,0 +1,1 @@
+"""What runs leave: the store, the identity of a run, summaries, intervals and paired differences."""

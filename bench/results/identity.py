@@ -1,0 +1,94 @@
+"""Which runs are done: the identity of a run, and who may write.
+
+A run is known by the hash of all that decides its numbers: its spec with every default, the readings of a recorded log,
+the code of this package, and the versions of what it computes with. So a run that is in the store under its identity
+need not be made again, and one whose spec or version has changed is another run.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from platform import python_version
+from typing import Any
+
+import numpy as np
+
+from ...estimators.registry import package_of
+
+COMPUTES_WITH = ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas")
+FINAL = ("done", "diverged")
+"""A run that ended so is not made again; one that failed (its worker died, its time was out) is."""
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Return what this process computes with: Python, packages, and the hash of our own code."""
+    found = {"python": python_version()}
+    for package in COMPUTES_WITH:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "absent"
+    return found | {"code": code_sha256()}
+
+
+@cache
+def code_sha256() -> str:
+    """Return the hash of the source files of our three packages, by name and content."""
+    digest = sha256()
+    for package in ("bench", "datasets", "estimators"):
+        sources = sorted((Path(__file__).parents[2] / package).rglob("*.py"))
+        for path in (path for path in sources if "__pycache__" not in path.parts):  # a profile's wrappers lie there
+            digest.update(
+                f"{package}/{path.as_posix().rpartition(f'/{package}/')[2]}".encode()
+                + sha256(path.read_bytes()).digest()
+            )
+    return digest.hexdigest()
+
+
+def content_sha256(value: Any) -> str:
+    """Return the hash of a log, or of anything made of dataclasses, arrays, mappings, sequences and plain values."""
+    digest = sha256()
+    _update(digest, value)
+    return digest.hexdigest()
+
+
+def _update(digest: Any, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        digest.update(f"{value.dtype} {value.shape}".encode())
+        digest.update(np.ascontiguousarray(value).data)
+    elif is_dataclass(value) and not isinstance(value, type):
+        digest.update(type(value).__name__.encode())
+        for field in fields(value):
+            digest.update(field.name.encode())
+            _update(digest, getattr(value, field.name))
+    elif isinstance(value, Mapping):
+        for key, item in value.items():
+            digest.update(repr(key).encode())
+            _update(digest, item)
+    elif isinstance(value, tuple | list):
+        digest.update(f"{len(value)}".encode())
+        for item in value:
+            _update(digest, item)
+    else:
+        digest.update(repr(value).encode())
+
+
+def identity(spec: Mapping[str, Any], readings_sha256: str | None, made_by: Mapping[str, str] | None = None) -> str:
+    """Return the identity of a run.
+
+    Args:
+        spec: as `Experiment.spec` gives it.
+        readings_sha256: of a recorded log, or of the recorded path that a simulated one follows; None for any other,
+            which its spec determines.
+        made_by: `versions` of an earlier day, for the identity that the run would have had then; today's without.
+    """
+    package = package_of(spec["estimator"]["name"])
+    decides = {"spec": spec, "readings": readings_sha256, "versions": made_by or versions(), "package": package}
+    return sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()

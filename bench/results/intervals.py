@@ -1,0 +1,61 @@
+"""How sure a number over seeds is: its bootstrap interval, the seeds being what is drawn from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import pandas as pd
+
+from ..experiment.comparison import OVER_SEEDS
+from ..metrics.scoring import POOLED
+from .paired import FEWEST_SEEDS, TAKE, bootstrap_interval
+from .summary import Record, groups, records, summarise
+
+RESAMPLES = 1999
+TABLED = ("ate_rmse_m", "heading_rmse_deg", "drift_end_percent", "rpe_rmse_m")
+"""Scores whose intervals stand in table.csv and table.tex."""
+
+
+def interval_over_seeds(done: Sequence[Record], score: str) -> tuple[float, float] | None:
+    """Return the 95 % bootstrap interval of what `summarise` makes of a score; None with fewer than FEWEST_SEEDS seeds.
+
+    Bias-corrected and accelerated, and of percentiles for a median, as `paired.difference` has it; with few seeds it
+    is too narrow by as much as is said there.
+
+    Args:
+        done: the rows of one log, estimator and output that came to their end.
+        score: one of `paired.OVER_SEEDS`.
+    """
+    known = [row for row in done if row[score] is not None]
+    if len(known) < FEWEST_SEEDS:
+        return None
+    weights = tuple(float(row[POOLED[score]]) if score in POOLED else 1.0 for row in known)
+    return _interval(tuple(float(row[score]) for row in known), weights, score)
+
+
+@lru_cache(maxsize=10_000)
+def _interval(values: tuple[float, ...], weights: tuple[float, ...], score: str) -> tuple[float, float]:
+    over = OVER_SEEDS[score]
+    return bootstrap_interval(
+        (np.array(values), np.array(weights)),
+        lambda value, weight, axis=-1: TAKE[over](value, weight, axis),
+        method="percentile" if over == "median" else "BCa",
+        seed=0,
+        confidence_level=0.95,
+        n_resamples=RESAMPLES,
+    )
+
+
+def summarise_with_intervals(rows: pd.DataFrame) -> list[Record]:
+    """Return what `summarise` does, and `<score>_low`, `<score>_high` for each score of TABLED: None with few seeds."""
+    done = [row for row in records(rows) if row["status"] == "done"]
+    by_output = groups(done, "log", "label", "output")
+    summary = summarise(rows)
+    for record in summary:
+        of_output = by_output.get((record["log"], record["label"], record["output"]), [])
+        for score in TABLED:
+            low, high = interval_over_seeds(of_output, score) or (None, None)
+            record |= {f"{score}_low": low, f"{score}_high": high}
+    return summary

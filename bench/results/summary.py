@@ -1,0 +1,179 @@
+"""The rows of the store as people read them: one record per log, estimator and output, its seeds pooled."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
+from statistics import fmean, median
+from typing import Any, TypeAlias
+
+import numpy as np
+import pandas as pd
+
+from ..metrics import BLOCKS, pooled_rmse
+from ..metrics.consistency import anees_of, pooled_nis
+from ..metrics.floor_ratio import OVER, rmse_over_floor
+from ..metrics.scoring import INNOVATIONS, MEAN, MEDIAN, POOLED
+
+Record: TypeAlias = dict[str, Any]
+"""One row, absent values being None."""
+
+
+SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
+SEEDS_ENOUGH = 5
+"""With fewer seeds an interval for ANEES is so wide that only NIS, where it was asked for, is worth a table."""
+
+COUNTS = {
+    "readings": ("readings",),
+    "late_used": ("late_used", "replayed"),  # by a smoother, by a filter that went back
+    "late_dropped": ("late",),
+    "carried": ("carried",),
+}
+"""What estimators did with readings that came late or between keyframes; summed over seeds."""
+
+UNFINISHED = ("diverged", "failed", "absent")
+"""How a run ends that is not done."""
+
+OUTLIERS = "outliers_"
+"""Counts of this prefix say how many readings an estimator took for outliers, or weighed down."""
+
+
+def records(rows: pd.DataFrame) -> list[Record]:
+    """Return the rows of a table of runs as plain Python."""
+    return [
+        {str(name): None if pd.isna(value) else value for name, value in row.items()} for row in rows.to_dict("records")
+    ]
+
+
+def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Record]]:
+    """Return the rows by these keys, in order of first appearance."""
+    found: dict[tuple[Any, ...], list[Record]] = {}
+    for row in rows:
+        found.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return found
+
+
+def file_names(names: Iterable[str]) -> dict[str, str]:
+    """Return for each name one that a file, or a LaTeX label, may have; no two differ in capitals alone."""
+    found: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)
+        taken = {other.lower() for other in found.values()}
+        numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
+        found[name] = next(one for one in numbered if one.lower() not in taken)
+    return found
+
+
+def summarise(rows: pd.DataFrame) -> list[Record]:
+    """Return one record per log, estimator and output, over the seeds that came to their end.
+
+    Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES, coverage are means; of
+    costs, the median is taken. `runs` and `done` say over how many, `diverged`, `failed` and `absent` what became of
+    the rest; where none is done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, by
+    degree of freedom, with the number of those times at which it lies above and below its interval. `start` says where
+    the priors came from, each way once.
+    """
+    every = records(rows)
+    ends = {
+        key: [run[0]["status"] for run in groups(of, "seed").values()]
+        for key, of in groups(every, "log", "label").items()
+    }
+    counted = COUNTS | {name: (name,) for name in _outliers(every)}
+    summary = []
+    for (log, label, output), group in groups(every, "log", "label", "output").items():
+        done = [row for row in group if row["status"] == "done"]
+        record: Record = {"log": log, "label": label, "output": output}
+        record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
+        starts = dict.fromkeys(row["start"] for row in group if row.get("start") is not None)
+        record |= {"start": " | ".join(starts) or None}
+        record |= _rpe_step(group)
+        record |= {"runs": len(ends[log, label]), "done": len(done)}
+        record |= {status: ends[log, label].count(status) for status in UNFINISHED}
+        record |= {n: sum(row[n] or 0 for row in done) for n in ("n_scored", "n_rpe")}
+        record |= {name: _pooled(done, name, n) for name, n in POOLED.items()}
+        record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
+        record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
+        record |= _over_floor(done)
+        record |= _honesty(done)
+        counts = [json.loads(row["counts"] or "{}") for row in done]
+        record |= {name: sum(run.get(of, 0) for run in counts for of in each) for name, each in counted.items()}
+        summary.append(record)
+    return summary
+
+
+def _rpe_step(group: Sequence[Record]) -> Record:
+    """Return which RPE a group's is, from its spec; None where that does not tell."""
+    scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
+    return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
+
+
+def _pooled(done: Sequence[Record], name: str, n: str) -> float | None:
+    known = [row for row in done if row[name] is not None]
+    return pooled_rmse([row[name] for row in known], [row[n] for row in known]) if known else None
+
+
+def _over_seeds(statistic: Callable[[list[float]], float], done: Sequence[Record], name: str) -> float | None:
+    known = [row[name] for row in done if row[name] is not None]
+    return statistic(known) if known else None
+
+
+def _over_floor(done: Sequence[Record]) -> Record:
+    """Return each RMSE over its floor, with its 95 % interval over seeds."""
+    record: Record = {}
+    for block, (score, floor) in OVER.items():
+        known = [row for row in done if row[score] is not None and row[floor]]  # over no floor there is no ratio
+        squared_error, bound = (np.array([row[name] ** 2 for row in known]) for name in (score, floor))
+        ratio = rmse_over_floor(squared_error, bound) if known else None
+        for part, name in {"": "ratio", "_low": "low", "_high": "high"}.items():
+            record[f"over_floor_{block}{part}"] = None if ratio is None else getattr(ratio, name)
+    return record
+
+
+def _honesty(done: Sequence[Record]) -> Record:
+    """Return NIS by sensor, and ANEES by block with its verdicts."""
+    record: Record = dict.fromkeys(INNOVATIONS)
+    record |= {f"nis_{sensor}": float(nis.value[0]) for sensor, nis in pooled_nis(done).items()}
+    found = anees_of([row["nees_at"] for row in done])
+    for block in BLOCKS:
+        average = found.get(block)
+        record[f"anees_{block}"] = None if average is None else float(average.value.mean())
+        record[f"anees_{block}_above"] = None if average is None else int(average.above.sum())
+        record[f"anees_{block}_below"] = None if average is None else int(average.below.sum())
+    record["anees_times"] = max((len(average) for average in found.values()), default=None)
+    record["n_not_positive"] = sum(int(row["n_not_positive"] or 0) for row in done)
+    return record
+
+
+CONSISTENCY = ("log", "label", "output", "score", "t_s", "seeds", "dof", "per_dof", "low", "high", "verdict")
+
+
+def consistency(rows: pd.DataFrame) -> list[Record]:
+    """Return one record per ANEES (log, estimator, output, block, time) and per pooled NIS, with its interval."""
+    table = []
+    for (log, label, output), group in groups(records(rows), "log", "label", "output").items():
+        done = [row for row in group if row["status"] == "done"]
+        named = {f"nees_{block}": average for block, average in anees_of([row["nees_at"] for row in done]).items()}
+        named |= {f"nis_{sensor}": average for sensor, average in pooled_nis(done).items()}
+        for name, average in named.items():
+            for k in range(len(average)):
+                verdict = "above" if average.above[k] else "below" if average.below[k] else "inside"
+                each = {"t_s": average.t_s[k], "seeds": average.runs[k], "dof": average.dof[k]}
+                each |= {"per_dof": average.value[k], "low": average.low[k], "high": average.high[k]}
+                table.append(
+                    {"log": log, "label": label, "output": output, "score": name} | each | {"verdict": verdict}
+                )
+    return table
+
+
+def is_judged(summary: Sequence[Record]) -> bool:
+    """Return whether there is enough of honesty to show: some NIS, or ANEES over enough seeds."""
+    enough = [row["done"] >= SEEDS_ENOUGH and row["anees_times"] is not None for row in summary]
+    return any(enough) or any(row[name] is not None for row in summary for name in INNOVATIONS)
+
+
+def _outliers(rows: Iterable[Record]) -> list[str]:
+    """Return the names of all counts of outliers that any run has."""
+    names = {name for row in rows for name in json.loads(row["counts"] or "{}") if name.startswith(OUTLIERS)}
+    return sorted(names)

@@ -1,0 +1,612 @@
+"""What `log.yaml` may say: the models of a log's description, one per part, and the check that names what is wrong.
+
+A description tells where each stream's numbers lie and what they mean; `conversion` turns the numbers into a Log.
+Lengths of lists are checked here, so nothing is read before the whole description is known to be sound.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_validator
+from scipy.spatial.transform import Rotation
+
+from ..errors import DatasetError, nearest
+from ..formats.columns import Column, Part, Table
+from ..formats.recording import Recording, loader
+from ..quantities import Finite, NotNegative, Positive, Vector
+from ..rig import ImuNoise, Mounting
+from ..state import LIMIT_NS, Array, Belief, NavState
+
+Sigma = Annotated[float, Field(gt=0)]
+Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
+"""Seconds to add to a time, s: 73 years at most, so that no sum of them overflows."""
+Matrix = tuple[Vector, Vector, Vector]
+Checked = TypeVar("Checked", bound=BaseModel)
+
+
+class DeviceClock(Part):
+    """A clock inside the sensor, exact but free-running, put onto the host's.
+
+    A straight line (offset and drift) is laid along the smallest reception delays of the host's stamps.
+    """
+
+    field: str
+    """Field of the message, s."""
+    wraps_at_s: Positive
+    """The clock jumps back to zero here."""
+
+
+class Message(Part):
+    """Messages of the recording; each field is a column, and so is what the format adds (its `host_clock`, for one)."""
+
+    names: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Joined where their device clocks agree when there are several; columns are then `Name.field`."""
+    entity: int | None = None
+    """Which of several senders of that name: `src_ent` in IMC, any when left out; the instance in ArduPilot, where
+    it may be left out only if there is one."""
+    clock: DeviceClock | None = None
+    """Adds the column `device`: this clock, unwrapped and put onto the host's, s."""
+
+    @model_validator(mode="after")
+    def _joined_by_a_clock(self) -> Self:
+        if len(self.names) > 1 and self.clock is None:
+            raise ValueError("several messages are joined on a device clock: `clock` is missing")
+        return self
+
+
+class Quantity(Part):
+    """Columns of one physical quantity: (raw · scale + offset), in `unit`."""
+
+    units: ClassVar[dict[str, float]] = {}
+    width: ClassVar[int | None] = None
+
+    columns: Annotated[tuple[Column, ...], Field(min_length=1)]
+    unit: str
+    scale: Finite | tuple[Finite, ...] = 1.0
+    """One for all columns or one each; −1 turns a sign."""
+    offset: Finite | tuple[Finite, ...] = 0.0
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.unit not in self.units:
+            raise ValueError(
+                f"unknown unit {self.unit!r}; known: {', '.join(self.units)}{nearest(self.unit, self.units)}"
+            )
+        if self.width is not None and len(self.columns) != self.width:
+            raise ValueError(f"expected {self.width} columns, found {len(self.columns)}")
+        for name in ("scale", "offset"):
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) != len(self.columns):
+                raise ValueError(f"{name}: expected one number or {len(self.columns)}, found {len(value)}")
+        return self
+
+
+class Height(Quantity):
+    """One length."""
+
+    units = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048}
+    width = 1
+
+
+class Lengths(Height):
+    """Three lengths."""
+
+    width = 3
+
+
+class Speeds(Quantity):
+    """Any number of velocities."""
+
+    units = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "kn": 1852 / 3600, "km/h": 1 / 3.6}
+
+
+class Velocity(Speeds):
+    """Three velocities."""
+
+    width = 3
+
+
+class Rate(Quantity):
+    """Three angular rates."""
+
+    units = {"rad/s": 1.0, "deg/s": np.pi / 180}
+    width = 3
+
+
+class Acceleration(Quantity):
+    """Three specific forces; g is 9.80665 m/s²."""
+
+    units = {"m/s^2": 1.0, "m/s²": 1.0, "g": 9.80665, "mg": 9.80665e-3}
+    width = 3
+
+
+class Angle(Quantity):
+    """One angle."""
+
+    units = {"rad": 1.0, "deg": np.pi / 180}
+    width = 1
+
+
+class Angles(Angle):
+    """Three angles."""
+
+    width = 3
+
+
+class Geodetic(Part):
+    """Latitude and longitude (north and east positive), and the height where there is one.
+
+    W is tangent at the origin; heights stay what they are above the surface, as the depth sensor has them.
+    """
+
+    latitude: Column
+    longitude: Column
+    unit: Literal["deg", "rad", "ddmm"] = "deg"
+    """ddmm is degrees · 100 + minutes, as NMEA writes it."""
+    altitude: Height | None = None
+
+
+class Attitude(Part):
+    """Full attitude, as rotation matrix by rows (9 columns), quaternion (4) or roll, pitch, yaw (3, order Z-Y-X)."""
+
+    columns: tuple[Column, ...]
+    form: Literal["matrix", "quaternion_xyzw", "quaternion_wxyz", "roll_pitch_yaw"]
+    unit: Literal["rad", "deg"] = "rad"
+    world: Literal["ENU", "NED", "ECEF"] = "ENU"
+    axes: Literal["FLU", "FRD"] = "FLU"
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        expected = {"matrix": 9, "roll_pitch_yaw": 3}.get(self.form, 4)
+        if len(self.columns) != expected:
+            raise ValueError(f"{self.form}: expected {expected} columns, found {len(self.columns)}")
+        return self
+
+
+class Time(Part):
+    """When a row was true, and when it was received."""
+
+    column: Column | None = None
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    row_rate_hz: Positive | None = None
+    """Instead of a column: the time is the row's index at this rate."""
+    start_s: Finite = 0.0
+    """Time of row 0, with row_rate_hz."""
+    clock_offset_s: Shift = 0.0
+    """Added to the stamps, to bring this sensor's clock onto the log's."""
+    delay_s: Annotated[Shift, Field(ge=0)] = 0.0
+    """The stamp is the reception, and the row was true this much earlier."""
+    received: Column | None = None
+    """Column of the reception, same unit and clock."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.column is None) == (self.row_rate_hz is None):
+            raise ValueError("give one of `column` and `row_rate_hz`")
+        if self.delay_s and self.received is not None:
+            raise ValueError("give one of `delay_s` and `received`")
+        return self
+
+
+class Valid(Part):
+    """Rows count only where this column holds one of these values."""
+
+    column: Column
+    values: Annotated[tuple[Finite, ...], Field(min_length=1)]
+
+
+class Outliers(Part):
+    """The whole row is dropped where the norm of these components, in SI, exceeds `above`."""
+
+    above: Positive
+    components: tuple[Annotated[int, Field(ge=0, le=2)], ...] | None = None
+    """Which, from 0; all when left out."""
+
+
+class MountingDescription(Part):
+    """Pose of a sensor's axes (FRD already turned to FLU) on the body FLU: R_BS = Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    translation_m: Vector = (0.0, 0.0, 0.0)
+    roll_deg: Finite = 0.0
+    pitch_deg: Finite = 0.0
+    yaw_deg: Finite = 0.0
+    R_BS: Matrix | None = None
+    """Instead of the angles: the rotation itself, by rows."""
+
+    @model_validator(mode="after")
+    def _is_a_mounting(self) -> Self:
+        if self.R_BS is not None and (self.roll_deg or self.pitch_deg or self.yaw_deg):
+            raise ValueError("give R_BS or the angles, not both")
+        self.mounting()
+        return self
+
+    def mounting(self) -> Mounting:
+        """Return the mounting, in our types."""
+        p_BS_B = np.array(self.translation_m)
+        if self.R_BS is not None:
+            return Mounting(np.array(self.R_BS), p_BS_B)
+        angles_deg = [self.yaw_deg, self.pitch_deg, self.roll_deg]
+        if not any(angles_deg):
+            return Mounting(np.eye(3), p_BS_B)
+        return Mounting(Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix(), p_BS_B)
+
+
+class NoiseDescription(Part):
+    """The IMU's noise, equal on three axes; `ImuNoise` has the units."""
+
+    gyro_density: NotNegative
+    accel_density: NotNegative
+    gyro_walk: NotNegative
+    accel_walk: NotNegative
+    gyro_bias_sigma: NotNegative
+    accel_bias_sigma: NotNegative
+
+    def noise(self) -> ImuNoise:
+        """Return the noise, in our types."""
+        return ImuNoise(**self.model_dump())
+
+
+class SourceDescription(Part):
+    """A source of columns, a time, and rows to pass over."""
+
+    table: Table | None = None
+    message: Message | None = None
+    time: Time
+    valid: Valid | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.table is None) == (self.message is None):
+            raise ValueError("give one of `table` and `message`")
+        return self
+
+
+class StreamDescription(SourceDescription):
+    """What all streams have."""
+
+    every: Annotated[int, Field(ge=1)] = 1
+    """Keep every n-th of the rows that are left."""
+
+
+class ImuDescription(StreamDescription):
+    """Gyro and accelerometer; each sample is taken for the mean over the interval that ends at its time."""
+
+    gyro: Rate
+    accel: Acceleration
+    accel_source: SourceDescription | None = None
+    """Where the accelerometer's rows are, when they are not the gyro's: interpolated linearly to the gyro's times."""
+    axes: Literal["FLU", "FRD"] = "FLU"
+    mounting: MountingDescription = MountingDescription()
+    noise: NoiseDescription
+
+
+class AidingDescription(StreamDescription):
+    """An aiding sensor: its sigma is fixed (the field that names the unit), or `sigma`, columns row by row."""
+
+    sigma_field: ClassVar[str]
+    outliers: Outliers | None = None
+
+    @model_validator(mode="after")
+    def _one_sigma(self) -> Self:
+        if (getattr(self, "sigma", None) is None) == (getattr(self, self.sigma_field) is None):
+            raise ValueError(f"give one of `{self.sigma_field}` and `sigma` (columns)")
+        return self
+
+
+class DvlDescription(AidingDescription):
+    """Bottom-track velocity of the vehicle over ground, in the DVL's axes, which are the body's; or a wheel's speed."""
+
+    sigma_field = "sigma_m_s"
+    velocity: Speeds
+    measures: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
+    """The axes that the columns of `velocity` (and of `sigma`) are; an axis left out is unmeasured: its sigma is
+    infinite."""
+    axes: Literal["FLU", "FRD"] = "FLU"
+    mounting: MountingDescription = MountingDescription()
+    """Turns what is measured into B's axes; its translation must be zero, since B sits in the DVL."""
+    sigma_m_s: Sigma | tuple[Sigma, ...] | None = None
+    sigma: Speeds | None = None
+
+    @model_validator(mode="after")
+    def _axes_fit(self) -> Self:
+        if len(set(self.measures)) != len(self.measures):
+            raise ValueError("measures: an axis stands there twice")
+        if len(self.velocity.columns) != len(self.measures):
+            raise ValueError(f"velocity: expected {len(self.measures)} columns, found {len(self.velocity.columns)}")
+        if isinstance(self.sigma_m_s, tuple) and len(self.sigma_m_s) != len(self.measures):
+            raise ValueError(f"sigma_m_s: expected {len(self.measures)} numbers, found {len(self.sigma_m_s)}")
+        if any(self.mounting.translation_m):
+            raise ValueError("mounting: B sits in the DVL; give the other sensors' translations from there")
+        if self.mounting != MountingDescription() and len(self.measures) < 3:
+            raise ValueError("mounting: only a velocity measured along all three axes can be turned")
+        return self
+
+
+class DepthDescription(AidingDescription):
+    """Height or depth of the pressure sensor against the surface."""
+
+    sigma_field = "sigma_m"
+    depth: Height
+    positive: Literal["up", "down"] = "down"
+    sigma_m: Sigma | None = None
+    sigma: Height | None = None
+    mounting: MountingDescription = MountingDescription()
+
+
+class Placed(Part):
+    """A place: geodetic, or in local axes, or both (a local offset from a geodetic point); or earth-centred (ECEF)."""
+
+    geodetic: Geodetic | None = None
+    position: Lengths | None = None
+    frame: Literal["ENU", "NED", "ECEF"] = "ENU"
+    """Axes of `position` (and of a truth's `velocity`); ECEF: earth-centred earth-fixed."""
+
+    @property
+    def on_the_globe(self) -> bool:
+        """Whether the place is one on the globe; else it is in W."""
+        return self.geodetic is not None or (self.position is not None and self.frame == "ECEF")
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if self.geodetic is not None and self.position is not None and self.frame == "ECEF":
+            raise ValueError("ECEF positions are places by themselves: leave `geodetic` out")
+        return self
+
+
+class GpsDescription(AidingDescription, Placed):
+    """Position of the antenna."""
+
+    sigma_field = "sigma_m"
+    sigma_m: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
+    """East, north, up; .inf for a component that was not measured. Without a height the third is taken as .inf."""
+    sigma: Lengths | None = None
+    mounting: MountingDescription = MountingDescription()
+
+    @model_validator(mode="after")
+    def _somewhere(self) -> Self:
+        if self.geodetic is None and self.position is None:
+            raise ValueError("give `geodetic`, `position` or both")
+        return self
+
+
+class HeadingDescription(AidingDescription):
+    """A heading, or a full attitude."""
+
+    sigma_field = "sigma_deg"
+    heading: Angle | None = None
+    convention: Literal["compass", "yaw"] = "compass"
+    """compass: clockwise from north; yaw: counter-clockwise from east."""
+    add_deg: Finite = 0.0
+    """Added to the angle as read, in its own convention: declination, deviation, offset."""
+    attitude: Attitude | None = None
+    sigma_deg: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
+    sigma: Angle | Angles | None = None
+    mounting: MountingDescription = MountingDescription()
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.heading is None) == (self.attitude is None):
+            raise ValueError("give one of `heading` and `attitude`")
+        width = 1 if self.heading is not None else 3
+        given = self.sigma.columns if self.sigma is not None else self.sigma_deg
+        if isinstance(given, tuple) and len(given) != width:
+            raise ValueError(f"expected {width} sigma, found {len(given)}")
+        return self
+
+
+def columns_of(part: BaseModel) -> list[Column]:
+    """Return every column that a part of a description names, in the order of its keys."""
+    found: list[Column] = []
+    for name in type(part).model_fields:
+        value = getattr(part, name)
+        if isinstance(value, Quantity | Attitude):
+            found += value.columns
+        elif isinstance(value, Geodetic):
+            found += [value.latitude, value.longitude, *columns_of(value)]
+        elif isinstance(value, Time):
+            found += [column for column in (value.column, value.received) if column is not None]
+        elif isinstance(value, Valid):
+            found.append(value.column)
+    return list(dict.fromkeys(found))
+
+
+class Streams(Part):
+    """The sensors; only the IMU must be there."""
+
+    imu: ImuDescription
+    dvl: DvlDescription | None = None
+    depth: DepthDescription | None = None
+    gps: GpsDescription | None = None
+    heading: HeadingDescription | None = None
+
+
+class TruthDescription(Placed):
+    """Where the vehicle was: one of a TUM file, a table of ours (`trajectory`), or a stream like the others."""
+
+    kind: Literal["truth", "reference"] = "truth"
+    """reference: another filter's output."""
+    tum: str | None = None
+    trajectory: str | None = None
+    """.parquet or .csv with the columns of `Trajectory.to_pandas`."""
+    lookahead_s: NotNegative | Annotated[float, Field(ge=0)] = 0.0
+    table: Table | None = None
+    message: Message | None = None
+    time: Time | None = None
+    valid: Valid | None = None
+    every: Annotated[int, Field(ge=1)] = 1
+    height_m: Finite | None = None
+    """Height over the surface, taken as constant, where the source has no height of the vehicle."""
+    velocity: Velocity | None = None
+    attitude: Attitude | None = None
+    """Without it the truth's R_WB are NaN: unknown."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        sources = [n for n in ("tum", "trajectory", "table", "message") if getattr(self, n) is not None]
+        if len(sources) != 1:
+            raise ValueError("give one of `tum`, `trajectory`, `table` and `message`")
+        if sources[0] in ("table", "message"):
+            if self.time is None or (self.geodetic is None and self.position is None):
+                raise ValueError("a truth from a stream needs `time`, and `geodetic` or `position`")
+            if self.position is None and self.geodetic and self.geodetic.altitude is None and self.height_m is None:
+                raise ValueError("no height: give `geodetic.altitude` or a constant `height_m`")
+        return self
+
+
+class Origin(Part):
+    """W's origin, given."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Field(ge=-360, le=360)]
+
+
+def _is_covariance(P: Array) -> bool:
+    """Whether P is symmetric and positive semi-definite; judged by its correlations, so units do not matter."""
+    sigma = np.sqrt(np.maximum(P.diagonal(), 0.0))
+    sigma[sigma == 0] = 1.0
+    with np.errstate(over="ignore"):
+        C = P / sigma / sigma[:, None]
+    if not (np.abs(C) < 1 + 1e-6).all() or not np.allclose(C, C.T, rtol=0, atol=1e-6):
+        return False
+    return bool(np.linalg.eigvalsh(C).min() > -1e-6)
+
+
+class PriorDescription(Part):
+    """A belief at the start, in our frames and SI."""
+
+    t_ns: Annotated[int, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
+    R_WB: Matrix
+    p_WB_W: Vector
+    v_WB_W: Vector
+    b_a: Vector
+    b_g: Vector
+    P: tuple[tuple[Finite, ...], ...]
+    """Symmetric and positive semi-definite: a zero says that this error is known to be none."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if len(self.P) != 15 or any(len(row) != 15 for row in self.P):
+            raise ValueError("P: expected 15 rows of 15")
+        R, P = np.array(self.R_WB), np.array(self.P)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
+                raise ValueError("R_WB is not a rotation")
+        if not _is_covariance(P):
+            raise ValueError("P is not symmetric and positive semi-definite")
+        return self
+
+    def belief(self) -> Belief:
+        """Return the belief, in our types."""
+        vectors = [np.array(x) for x in (self.p_WB_W, self.v_WB_W, self.b_a, self.b_g)]
+        return Belief(self.t_ns, NavState(np.array(self.R_WB), *vectors), np.array(self.P))
+
+
+class Description(Part):
+    """A log's description, `log.yaml`."""
+
+    name: str | None = None
+    """What tables call the log; the folder's name when left out."""
+    title: str = ""
+    source: str = ""
+    """Where the recording comes from, its licence, whom to cite."""
+    notes: tuple[str, ...] = ()
+    """Every quirk of the source in a sentence; what was fitted to the truth says so."""
+    gravity: Finite = 9.81
+    """m/s²."""
+    origin: Origin | None = None
+    """W's origin. When left out and the log is geodetic, it is the first fix (of gps, else of truth) at or after the
+    IMU's start, so that the vehicle starts at zero."""
+    recording: SerializeAsAny[Recording] | None = None
+    """The one file that the streams' messages are in, by its `format`; the format's loader says what else it takes."""
+    streams: Streams
+    truth: TruthDescription | None = None
+    prior: PriorDescription | None = None
+
+    @property
+    def parts(self) -> dict[str, StreamDescription | TruthDescription]:
+        """The streams that are there and, where it is one, the truth; by name."""
+        named = {name: getattr(self.streams, name) for name in Streams.model_fields} | {"truth": self.truth}
+        return {name: part for name, part in named.items() if part is not None}
+
+    @model_validator(mode="after")
+    def _messages_have_a_recording(self) -> Self:
+        sources = [*self.parts.values(), self.streams.imu.accel_source]
+        if self.recording is None and any(part is not None and part.message is not None for part in sources):
+            raise ValueError("streams name messages, but `recording` does not say which file they are in")
+        return self
+
+
+def read_description(path: Path) -> Description:
+    """Read and check a log.yaml.
+
+    Raises:
+        DatasetError: names the file, the key, what is wrong, and the nearest known key.
+    """
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
+        raise DatasetError(f"{path}: not YAML: {str(error)[:300] or type(error).__name__}") from None
+    if not isinstance(raw, dict):
+        raise DatasetError(f"{path}: expected keys and values, found {type(raw).__name__}")
+    return check_description(raw, str(path))
+
+
+def check_description(raw: dict[Any, Any], where: str) -> Description:
+    """Check a parsed description; `where` stands at the head of the error."""
+    recording = raw.get("recording")
+    if isinstance(recording, dict):
+        raw = {**raw, "recording": _checked(_loader(recording, where), recording, where, ("recording",))}
+    return _checked(Description, raw, where)
+
+
+def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple[str, ...] = ()) -> Checked:
+    """Return the part that `raw` describes, which stands at `above` in the description."""
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        lines = [_complaint(problem, model, above) for problem in error.errors(include_url=False)]
+        raise DatasetError(f"{where}: " + f"\n{where}: ".join(dict.fromkeys(lines))) from None
+    except (RecursionError, OverflowError) as error:
+        raise DatasetError(f"{where}: cannot be understood: {error}") from None
+
+
+def _loader(recording: dict[Any, Any], where: str) -> type[Recording]:
+    if "format" not in recording:
+        raise DatasetError(f"{where}: missing key `recording.format`")
+    try:
+        return loader(recording["format"])
+    except DatasetError as error:
+        raise DatasetError(f"{where}: `recording.format`: {error}") from None
+
+
+def _complaint(problem: Any, model: type[BaseModel], above: tuple[str, ...]) -> str:
+    """Turn one of pydantic's errors into a sentence with the key's path; `model` stands at `above`."""
+    loc: tuple[Any, ...] = problem["loc"]
+    path = ".".join(str(step) for step in (*above, *loc)) or "top level"
+    if problem["type"] == "extra_forbidden":
+        known = _known_keys(loc[:-1], model)
+        return f"unknown key `{path}`{nearest(str(loc[-1]), known)} (known: {', '.join(known)})"
+    if problem["type"] == "missing":
+        return f"missing key `{path}`"
+    message = problem["msg"].removeprefix("Value error, ")
+    found = "" if isinstance(problem["input"], dict | BaseModel) else f", found {str(problem['input'])[:60]!r}"
+    return f"`{path}`: {message}{found}"
+
+
+def _known_keys(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
+    """Return the keys of the model that stands at `loc` under `model`."""
+    for step in loc:
+        info = model.model_fields.get(str(step))
+        if info is None:
+            continue
+        choices = [info.annotation, *get_args(info.annotation)]
+        models = [c for c in choices if isinstance(c, type) and issubclass(c, BaseModel)]
+        if models:
+            model = models[-1]
+    return list(model.model_fields)

@@ -1,0 +1,73 @@
+"""Open a log: by the name of a catalog entry, by folder, or by a description beside its data."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..errors import DatasetError, nearest
+from ..log import Log
+from .conversion import build_log
+from .description import read_description
+
+CATALOG = Path(__file__).parents[1] / "catalog"
+
+
+class RecordingNotFound(DatasetError):  # noqa: N818  (a plain statement of what is not there)
+    """The description is known, but the recording it tells of is not where it was looked for."""
+
+
+def catalog_names() -> list[str]:
+    """Return the names of the logs whose descriptions come with this package."""
+    return sorted(path.stem for path in CATALOG.glob("*.yaml"))
+
+
+def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repair: bool = False) -> Log:
+    """Open a log.
+
+    Args:
+        name_or_folder: a catalog entry's name, or its recording's folder; or a folder with a log.yaml; or a description
+            file (.yaml), whose files lie in `data`, or beside it.
+        data: folder whose subfolders are the recordings; FATHOM_DATA when left out.
+        repair: drop rows that are not finite or not in order, and count them in the log's notes, instead of refusing.
+
+    Raises:
+        RecordingNotFound: the catalog entry is known, its recording is not there.
+        DatasetError: anything else that is wrong, naming what, where, and the nearest known name.
+    """
+    path = Path(name_or_folder)
+    try:
+        if (path / "log.yaml").is_file():
+            return build_log(read_description(path / "log.yaml"), path, repair=repair)
+        if path.suffix == ".yaml" and path.is_file():
+            folder = path.parent if data is None else Path(data)
+            return build_log(read_description(path), folder, repair=repair)
+        if str(name_or_folder) in catalog_names():
+            return _open_catalogued(str(name_or_folder), data, repair=repair)
+        is_folder = path.is_dir()
+        if is_folder and path.resolve().name in catalog_names():  # the recording's own folder
+            return build_log(read_description(CATALOG / f"{path.resolve().name}.yaml"), path, repair=repair)
+    except (OSError, ValueError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{name_or_folder}: cannot be opened: {error}") from None
+    if is_folder:
+        raise DatasetError(
+            f"{path}: no log.yaml in this folder; it describes the files (see fathom.datasets.described.description)"
+        )
+    names = catalog_names()
+    hint = nearest(str(name_or_folder), names)
+    raise DatasetError(f"{name_or_folder}: no such log{hint}; neither a folder nor a known name ({', '.join(names)})")
+
+
+def _open_catalogued(name: str, data: str | Path | None, *, repair: bool) -> Log:
+    root = data if data is not None else os.environ.get("FATHOM_DATA") or None
+    if root is None:
+        raise RecordingNotFound(f"{name}: nobody said where recordings are; use --data DIR or set FATHOM_DATA")
+    folder = Path(root) / name
+    if not folder.is_dir():
+        whence = "--data" if data is not None else "FATHOM_DATA"
+        raise RecordingNotFound(
+            f"{name}: no folder {folder} ({whence}); point --data or FATHOM_DATA at its parent folder"
+        )
+    return build_log(read_description(CATALOG / f"{name}.yaml"), folder, repair=repair)

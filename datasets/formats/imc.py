@@ -1,0 +1,310 @@
+"""IMC logs (LSF), the format of the LSTS toolchain: concatenated little-endian messages with a CRC each.
+
+The file is read in chunks, straight out of an archive where it is in one, and only the messages asked for are kept.
+A message whose CRC is wrong is passed over, and reading goes on at the next sync word.
+"""
+
+from __future__ import annotations
+
+import gzip
+import xml.etree.ElementTree as ET
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, ClassVar
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DatasetError, nearest, nearest_file
+from .recording import Held, Messages, Recording, Wanted, not_held
+
+HEADER = np.dtype(
+    [("sync", "<u2"), ("id", "<u2"), ("size", "<u2"), ("timestamp", "<f8"), ("src", "<u2"), ("src_ent", "u1"),
+     ("dst", "<u2"), ("dst_ent", "u1")]
+)  # fmt: skip
+CHUNK_BYTES = 1 << 20
+TYPES = {"int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
+         "int64_t": "<i8", "fp32_t": "<f4", "fp64_t": "<f8"}  # fmt: skip
+BROKEN = (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, ValueError)
+"""What the standard library raises on a damaged archive."""
+
+_XYZ = "time:f8 x:f8 y:f8 z:f8"
+_ESTIMATE = (
+    "lat:f8 lon:f8 height:f4 x:f4 y:f4 z:f4 phi:f4 theta:f4 psi:f4 u:f4 v:f4 w:f4 "
+    "vx:f4 vy:f4 vz:f4 p:f4 q:f4 r:f4 depth:f4 alt:f4"
+)
+BUILT_IN = {
+    "EulerAngles": (254, "time:f8 phi:f8 theta:f8 psi:f8 psi_magnetic:f8"),
+    "AngularVelocity": (256, _XYZ),
+    "Acceleration": (257, _XYZ),
+    "MagneticField": (258, _XYZ),
+    "GroundVelocity": (259, "validity:u1 x:f8 y:f8 z:f8"),
+    "WaterVelocity": (260, "validity:u1 x:f8 y:f8 z:f8"),
+    "Temperature": (263, "value:f4"),
+    "Pressure": (264, "value:f8"),
+    "Depth": (265, "value:f4"),
+    "EstimatedState": (350, _ESTIMATE),
+}
+"""Messages of IMC 5.4, for logs without their definitions."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A message's number and its leading fields of fixed size."""
+
+    mgid: int
+    fields: np.dtype[Any]
+
+
+@dataclass(frozen=True)
+class LsfRead:
+    """What a file held: per message name its rows (header's timestamp, src_ent, and the fields), and notes."""
+
+    rows: dict[str, NDArray[Any]]
+    notes: tuple[str, ...]
+
+
+def built_in_layouts() -> dict[str, Layout]:
+    """Return the messages known without a definitions file."""
+    layouts = {}
+    for name, (mgid, fields) in BUILT_IN.items():
+        dtype = np.dtype([(f.split(":")[0], "<" + f.split(":")[1]) for f in fields.split()])
+        layouts[name] = Layout(mgid, dtype)
+    return layouts
+
+
+def parse_definitions(xml: bytes, where: str) -> dict[str, Layout]:
+    """Return the messages of an IMC.xml; a message is cut before its first field of variable size."""
+    try:
+        root = ET.fromstring(xml)
+        layouts = {}
+        for message in root.iter("message"):
+            fields = []
+            for item in message.findall("field"):
+                if item.get("type") not in TYPES:
+                    break
+                fields.append((str(item.get("abbrev")), TYPES[str(item.get("type"))]))
+            layouts[str(message.get("abbrev"))] = Layout(int(message.get("id", "-1")), np.dtype(fields))
+    except (ET.ParseError, ValueError) as error:
+        raise DatasetError(f"{where}: not a list of IMC messages: {error}") from None
+    return layouts
+
+
+class ImcRecording(Recording):
+    """An IMC log (LSF), bare, gzipped or inside a ZIP archive. A message's sender is its `src_ent`."""
+
+    host_clock: ClassVar = ("timestamp", "s")
+    suffixes: ClassVar = (".lsf", ".lsf.gz")
+
+    member: str | None = None
+    """Its path inside the archive."""
+    definitions: str | None = None
+    """IMC.xml or IMC.xml.gz, inside the same archive or folder; a short built-in list when left out."""
+    source: int | None = None
+    """Keep only messages with this `src`."""
+
+    def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
+        """Read the messages asked for; see `Recording.read`."""
+        where = str(folder / self.file)
+        layouts = self._layouts(folder)
+        for want in wanted:
+            if want.message not in layouts:
+                hint = nearest(want.message, layouts)
+                raise DatasetError(f"{where}: unknown IMC message {want.message!r}{hint}")
+        with _opened(folder, self.file, self.member) as stream:
+            held = scan(stream, {want.message: layouts[want.message] for want in wanted}, self.source, where)
+        return Messages([_columns(held.rows[want.message], want, where) for want in wanted], held.notes)
+
+    def contents(self, folder: Path) -> list[Held]:
+        """Return the messages that the log holds, by name and entity."""
+        layouts = self._layouts(folder)
+        with _opened(folder, self.file, self.member) as stream:
+            held = scan(stream, layouts, self.source, str(folder / self.file))
+        found = []
+        for name, rows in held.rows.items():
+            fields = tuple(n for n in rows.dtype.names or () if n not in ("timestamp", "src_ent"))
+            for entity in np.unique(rows["src_ent"]).tolist():
+                stamps = rows["timestamp"][rows["src_ent"] == entity]
+                found.append(Held(name, "", len(stamps), float(np.ptp(stamps)), fields, entity))
+        return sorted(found, key=lambda h: (h.message, h.sender or 0))
+
+    def _layouts(self, folder: Path) -> dict[str, Layout]:
+        """Return the message layouts of the log: its own definitions, else the built-in ones."""
+        if self.definitions is None:
+            return built_in_layouts()
+        in_archive = self.file.endswith(".zip")
+        file, member = (self.file, self.definitions) if in_archive else (self.definitions, None)
+        where = f"{folder / file}: {self.definitions}"
+        with _opened(folder, file, member) as stream:
+            try:
+                xml = stream.read()
+            except BROKEN as error:
+                raise DatasetError(f"{where}: cannot be read: {error}") from None
+        return parse_definitions(xml, where)
+
+
+def _columns(rows: NDArray[Any], want: Wanted, where: str) -> dict[str, NDArray[Any]]:
+    """Return the columns asked for, of the entity asked for, as float64."""
+    if want.sender is not None:
+        entities = sorted(set(rows["src_ent"].tolist()))
+        rows = rows[rows["src_ent"] == want.sender]
+        if not len(rows):
+            raise DatasetError(f"{where}: no {want.message} from entity {want.sender}; it comes from {entities}")
+    if not len(rows):
+        raise DatasetError(f"{where}: no {want.message} in the log")
+    for column in want.columns:
+        if column not in (rows.dtype.names or ()):
+            raise not_held(where, f"field of {want.message} called", column, rows.dtype.names or ())
+    return {column: rows[column].astype(float) for column in want.columns}
+
+
+@contextmanager
+def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
+    """Open a file, or a member of an archive, as a stream of bytes; gunzipped where its name ends in .gz."""
+    path = folder / file
+    if not path.is_file():
+        raise DatasetError(f"{path}: no such file{nearest_file(path)}")
+    archive = None
+    try:
+        if path.suffix == ".zip":
+            archive = zipfile.ZipFile(path)
+            members = archive.namelist()
+            if member not in members:
+                hint = nearest(member or "", members)
+                raise DatasetError(f"{path}: no member {member!r}{hint}; it holds {', '.join(members[:20])}")
+            stream: IO[bytes] = archive.open(member)
+        else:
+            stream = path.open("rb")
+    except BROKEN as error:
+        if archive is not None:
+            archive.close()
+        if isinstance(error, DatasetError):
+            raise
+        raise DatasetError(f"{path}: cannot be opened: {error}") from None
+    try:
+        with stream:
+            yield gzip.GzipFile(fileobj=stream) if (member or file).endswith(".gz") else stream
+    finally:
+        if archive is not None:
+            archive.close()
+
+
+def scan(stream: IO[bytes], layouts: Mapping[str, Layout], source: int | None, where: str) -> LsfRead:
+    """Read a stream of IMC messages to its end, keeping those of `layouts`."""
+    rows: dict[str, list[NDArray[Any]]] = {name: [] for name in layouts}
+    carry, in_gap, final = b"", False, False
+    messages = gaps = skipped = short = 0
+    cut_off = ""
+    while not final:
+        try:
+            chunk = stream.read(CHUNK_BYTES)
+        except BROKEN as error:
+            chunk, cut_off = b"", f" ({error})"
+        final = not chunk
+        data = np.frombuffer(carry + chunk, np.uint8)
+        offsets, done, new_gaps, new_skipped, in_gap = _messages(data, final, in_gap, CRC_TABLE)
+        messages, gaps, skipped = messages + len(offsets), gaps + new_gaps, skipped + new_skipped
+        carry = data[done:].tobytes()
+        if len(offsets):
+            short += _keep(data, offsets, layouts, source, rows)
+    if messages == 0:
+        raise DatasetError(f"{where}: not one whole IMC message in it; is it an LSF log?")
+    truncated = in_gap or bool(carry) or bool(cut_off)
+    skipped += len(carry)
+
+    notes = []
+    corrupted = gaps - int(in_gap)
+    if corrupted:
+        notes.append(f"imc: {corrupted} stretches of corrupted messages passed over")
+    if truncated:
+        notes.append(f"imc: the file ends inside a message{cut_off}")
+    if skipped:
+        notes.append(f"imc: {skipped} bytes belong to no whole message")
+    if short:
+        notes.append(f"imc: {short} messages shorter than their definition dropped")
+    return LsfRead({name: _stacked(kept, layouts[name]) for name, kept in rows.items()}, tuple(notes))
+
+
+def _row_type(layout: Layout) -> np.dtype[Any]:
+    fields = [(str(n), layout.fields[n]) for n in layout.fields.names or ()]
+    return np.dtype([("timestamp", "<f8"), ("src_ent", "u1"), *fields])
+
+
+def _stacked(kept: list[NDArray[Any]], layout: Layout) -> NDArray[Any]:
+    return np.concatenate(kept) if kept else np.zeros(0, _row_type(layout))
+
+
+def _keep(
+    data: NDArray[np.uint8],
+    offsets: NDArray[np.int64],
+    layouts: Mapping[str, Layout],
+    source: int | None,
+    rows: dict[str, list[NDArray[Any]]],
+) -> int:
+    """Append the wanted messages of a chunk to `rows`; return how many were shorter than their definition."""
+    heads = data[offsets[:, None] + np.arange(HEADER.itemsize)].view(HEADER)[:, 0]
+    ours = np.ones(len(heads), bool) if source is None else heads["src"] == source
+    short = 0
+    for name, layout in layouts.items():
+        chosen = ours & (heads["id"] == layout.mgid)
+        whole = chosen & (heads["size"] >= layout.fields.itemsize)
+        short += int(np.count_nonzero(chosen & ~whole))
+        if not whole.any():
+            continue
+        body = offsets[whole, None] + HEADER.itemsize + np.arange(layout.fields.itemsize)
+        values = data[body].view(layout.fields)[:, 0]
+        kept = np.zeros(len(values), _row_type(layout))
+        kept["timestamp"], kept["src_ent"] = heads["timestamp"][whole], heads["src_ent"][whole]
+        for field in layout.fields.names or ():
+            kept[field] = values[field]
+        rows[name].append(kept)
+    return short
+
+
+def crc_table() -> NDArray[np.uint16]:
+    """Return the 256 steps of CRC-16 (IBM): polynomial 0x8005, reflected, starting from 0."""
+    table = np.arange(256, dtype=np.uint16)
+    for _ in range(8):
+        table = np.where(table & 1, (table >> 1) ^ 0xA001, table >> 1).astype(np.uint16)
+    return table
+
+
+CRC_TABLE = crc_table()
+
+
+@numba.njit(cache=True)
+def _messages(data, final, in_gap, table):  # pragma: no cover  (compiled)
+    """Find the whole messages of a chunk.
+
+    Returns their offsets, how far the chunk is dealt with, how many stretches of bad bytes begin in it, how many bytes
+    were passed over, and whether it ends inside such a stretch.
+    """
+    n = len(data)
+    offsets = np.empty(n // 22 + 1, np.int64)
+    found, at, gaps, skipped = 0, 0, 0, 0
+    while at + 22 <= n:
+        if data[at] == 0x54 and data[at + 1] == 0xFE:
+            end = at + 22 + (data[at + 4] | np.int64(data[at + 5]) << 8)
+            if end > n and not final:
+                break
+            if end <= n:
+                crc = np.uint16(0)
+                for i in range(at, end - 2):
+                    crc = np.uint16((crc >> 8) ^ table[(crc ^ data[i]) & 0xFF])
+                if crc == np.uint16(data[end - 2] | np.int64(data[end - 1]) << 8):
+                    offsets[found] = at
+                    found += 1
+                    at = end
+                    in_gap = False
+                    continue
+        if not in_gap:
+            gaps += 1
+            in_gap = True
+        at += 1
+        skipped += 1
+    return offsets[:found], at, gaps, skipped, in_gap

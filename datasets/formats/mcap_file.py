@@ -1,0 +1,405 @@
+"""MCAP files: messages in Protocol Buffers, ROS 2's CDR, ROS 1's bytes, or JSON.
+
+A file is read from front to back, chunk by chunk, and not by its index, which stands at its end and which a recorder
+that lost its power has not written.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DatasetError, one_line
+from .recording import extra, not_held
+from .ros_messages import Definitions, Types, definitions_of, ros_channel, short_name
+from .topics import NS, Channel, Found, Message, Misfit, ShortArray, TopicRecording
+
+MAGIC = b"\x89MCAP0\r\n"
+SCHEMA, CHANNEL, MESSAGE = 3, 4, 5
+"""Kinds of records in a chunk, their opcode."""
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
+
+
+class McapRecording(TopicRecording):
+    """An MCAP file. Messages are topics; `log_time` is when each was recorded, `publish_time` when it was sent."""
+
+    host_clock = ("log_time", "ns")
+    suffixes: ClassVar = (".mcap",)
+    stamps: ClassVar = ("log_time", "publish_time")
+
+    def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+        """Yield the messages of a file; see `TopicRecording.messages`."""
+        return mcap_messages(self.path(folder), {}, topics, found)
+
+
+def mcap_messages(
+    plain: Path, types: Types, topics: Collection[str] | None, found: Found, path: Path | None = None
+) -> Iterator[Message]:
+    """Yield the messages of an MCAP file; what is damaged is passed over and told in `found.notes`.
+
+    Args:
+        plain: the file.
+        path: what errors call it, where that is not its path.
+        types: definitions of ROS messages that the file does not define itself.
+
+    Raises:
+        DatasetError: not an MCAP file, or not one whole message in it.
+    """
+    with extra("mcap"):
+        from mcap.records import Chunk, Footer
+        from mcap.records import Message as Record
+        from mcap.stream_reader import StreamReader, get_chunk_data_stream
+    path = plain if path is None else path
+    reading = _Reading(path, types, topics, found)
+    finished, damaged = False, 0
+    try:
+        stream = plain.open("rb")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
+    with stream:
+        magic = stream.read(len(MAGIC))
+        if magic != MAGIC:
+            what = f"it begins with {magic!r}" if magic else "an empty file"
+            raise DatasetError(f"{path}: not an MCAP file: {what}")
+        size = plain.stat().st_size
+        records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=size).records
+        why = "the end of the file"
+        while True:
+            try:
+                record = next(records, None)
+            except Exception as error:  # the reader's many ways to fail
+                why = " ".join(f"{type(error).__name__} {error}".split())
+                break
+            if record is None:
+                break
+            if isinstance(record, Chunk):
+                try:
+                    data_stream, length = get_chunk_data_stream(record, validate_crc=True)
+                    data = data_stream.read(length)
+                except Exception:  # the decompressors' many ways to fail
+                    damaged += 1
+                    continue
+                yield from reading.chunk(data)
+            elif isinstance(record, Record):
+                yield from reading.message(record.channel_id, record.log_time, record.publish_time, record.data)
+            elif isinstance(record, Footer):
+                finished = True
+                break
+            else:
+                reading.define(record)
+    damaged += reading.damaged
+    if not finished:
+        found.notes.append(f"{path.name}: damaged, or cut off: nothing is read from there on ({why})")
+    if damaged:
+        found.notes.append(f"{path.name}: {damaged} damaged chunks or records passed over")
+    if not reading.whole:
+        told = "; ".join(["", *found.notes])
+        raise DatasetError(f"{path}: not one whole message in it{told}")
+
+
+class _Reading:
+    """What is known of a file while its records go by."""
+
+    def __init__(self, path: Path, types: Types, topics: Collection[str] | None, found: Found) -> None:
+        self.path, self.types, self.topics, self.found = path, types, topics, found
+        self.schemas: dict[int, Any] = {}
+        self.channels: dict[int, Channel] = {}
+        self.wanted: set[int] = set()
+        self.whole = self.damaged = 0
+
+    def chunk(self, data: bytes) -> Iterator[Message]:
+        """Yield the wanted messages of a chunk, up to where it is damaged."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Channel as ChannelRecord
+        from mcap.records import Schema
+
+        at = 0
+        while at < len(data):
+            try:
+                opcode, length = _RECORD.unpack_from(data, at)
+                at += _RECORD.size
+                if at + length > len(data):
+                    raise ValueError("beyond the chunk")
+                if opcode == MESSAGE:
+                    number, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
+                    if length < _MESSAGE.size:
+                        raise ValueError("too short for a message")
+                    body = data[at + _MESSAGE.size : at + length] if number in self.wanted else b""
+                    yield from self.message(number, log_ns, publish_ns, body)
+                elif opcode in (SCHEMA, CHANNEL):
+                    kind = Schema if opcode == SCHEMA else ChannelRecord
+                    self.define(kind.read(ReadDataStream(BytesIO(data[at : at + length]))))
+            except DatasetError:
+                raise
+            except Exception:  # the reader's many ways to fail
+                self.damaged += 1
+                return
+            at += length
+
+    def message(self, number: int, log_ns: int, publish_ns: int, data: bytes) -> Iterator[Message]:
+        """Yield a message, if it is of a wanted topic."""
+        channel = self.channels.get(number)
+        if channel is None:
+            self.damaged += 1
+            return
+        self.whole += 1
+        if self.topics is None or channel.topic in self.topics:
+            yield channel, (log_ns, publish_ns), data
+
+    def define(self, record: Any) -> None:
+        """Take in a schema or a channel."""
+        from mcap.records import Channel as ChannelRecord
+        from mcap.records import Schema
+
+        if isinstance(record, Schema):
+            self.schemas.setdefault(record.id, record)
+        elif isinstance(record, ChannelRecord) and record.id not in self.channels:
+            channel = _channel(record, self.schemas.get(record.schema_id), self.types, self.path)
+            self.channels[record.id] = channel
+            if self.topics is not None and channel.topic in self.topics:
+                self.wanted.add(record.id)
+            self.found.channels.append(channel)
+
+
+def _channel(record: Any, schema: Any, types: Types, path: Path) -> Channel:
+    """Return how the messages of a channel are read."""
+    where = f"{path}: {record.topic}"
+    kind = "" if schema is None else schema.name
+    if record.message_encoding in ("cdr", "ros1"):
+
+        @cache
+        def known() -> Types:
+            if schema is None or not schema.data:
+                return types
+            text = schema.data.decode(errors="replace")
+            return Definitions(definitions_of(text, schema.encoding, kind, where), types)
+
+        serialisation = "cdr" if record.message_encoding == "cdr" else "ros1"
+        return ros_channel(record.topic, short_name(kind), known, serialisation, where)
+    if record.message_encoding == "protobuf":
+        return _protobuf_channel(record.topic, kind, schema, where)
+    if record.message_encoding == "json":
+        return Channel(record.topic, kind, tuple, lambda wanted: JsonExtractor(wanted, where))
+
+    def refuse(*_: object) -> Any:
+        raise DatasetError(f"{where}: messages encoded as {record.message_encoding!r} are not supported")
+
+    return Channel(record.topic, kind, tuple, refuse)
+
+
+# -------------------------------------------------------------------------------------------------- Protocol Buffers
+
+
+def _protobuf_channel(topic: str, kind: str, schema: Any, where: str) -> Channel:
+    @cache
+    def decoder() -> Callable[[bytes], Any]:
+        with extra("mcap"):
+            from mcap_protobuf.decoder import DecoderFactory
+        try:
+            decode = DecoderFactory().decoder_for("protobuf", schema)
+            if decode is None:
+                raise ValueError(f"its schema is {None if schema is None else schema.encoding!r}")
+            decode(b"")
+        except Exception as error:  # a damaged schema: protobuf's many ways to fail
+            what = one_line(error)[:200]
+            raise DatasetError(f"{where}: the definition of {kind} cannot be understood: {what}") from None
+        return decode
+
+    def fields() -> tuple[str, ...]:
+        return tuple(_protobuf_fields(decoder()(b"").DESCRIPTOR, "", ()))
+
+    return Channel(topic, kind, fields, lambda wanted: ProtobufExtractor(decoder(), wanted, where))
+
+
+def _protobuf_fields(descriptor: Any, prefix: str, above: tuple[str, ...]) -> Iterator[str]:
+    """Yield the paths of a type's numbers; of a repeated field, that of its first element."""
+    if descriptor.full_name in above:
+        return  # a type may contain itself: it is listed once
+    for field in descriptor.fields:
+        path = f"{prefix}{field.name}.0" if _repeated(field) else prefix + field.name
+        if field.message_type is None:
+            if _code(field) is not None:
+                yield path
+        elif field.message_type.full_name in _TIMES:
+            yield path
+        elif not field.message_type.GetOptions().map_entry:
+            yield from _protobuf_fields(field.message_type, f"{path}.", (*above, descriptor.full_name))
+
+
+def _repeated(field: Any) -> bool:
+    return field.is_repeated if hasattr(field, "is_repeated") else field.label == field.LABEL_REPEATED
+
+
+def _code(field: Any) -> str | None:
+    """Return the struct code of a number; None where it is none."""
+    number = field.cpp_type
+    floats, unsigned = (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT), (field.CPPTYPE_UINT64,)
+    others = (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE)
+    return "d" if number in floats else "Q" if number in unsigned else None if number in others else "q"
+
+
+class ProtobufExtractor:
+    """Takes wanted numbers out of messages of one type of Protocol Buffers; an `Extractor`.
+
+    What a message leaves out and could have had is NaN; an integer or a time left out makes its message a misfit.
+    """
+
+    def __init__(self, decode: Callable[[bytes], Any], wanted: Sequence[str], where: str) -> None:
+        """Compile the reader.
+
+        Raises:
+            DatasetError: a column that is no number of the type (with the nearest).
+        """
+        self._decode = decode
+        descriptor = decode(b"").DESCRIPTOR
+        self._wanted = tuple(wanted)
+        self.codes: list[str] = []
+        self._paths = []
+        for column in wanted:
+            steps, code = _protobuf_path(descriptor, column)
+            if code is None:
+                known = _protobuf_fields(descriptor, "", ())
+                raise not_held(where, f"numeric field of {descriptor.full_name} called", column, known)
+            self._paths.append((column, steps, code))
+            self.codes.append("q" if code == "time" else code)
+
+    def __call__(self, data: bytes) -> list[Any]:
+        """Return the numbers, in the order of the columns."""
+        try:
+            message = self._decode(data)
+        except Exception as error:  # protobuf's DecodeError, and what its versions raise besides
+            raise Misfit(f"{type(error).__name__}: {error}") from None
+        return [_protobuf_value(message, column, steps, code) for column, steps, code in self._paths]
+
+    def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return the columns by name."""
+        return dict(zip(self._wanted, raw, strict=True))
+
+
+Path_ = tuple[tuple[str, bool, int | None], ...]
+"""Steps into a message: field, whether it may be absent, and the index into it where it is repeated."""
+
+
+def _protobuf_path(descriptor: Any, column: str) -> tuple[Path_, str | None]:
+    """Return the steps to a number and its code; None where there is no such number."""
+    steps: list[tuple[str, bool, int | None]] = []
+    names = column.split(".")
+    while names:
+        field = None if descriptor is None else descriptor.fields_by_name.get(names.pop(0))
+        if field is None:
+            return (), None
+        index = None
+        if _repeated(field):
+            if not names or not (names[0].isascii() and names[0].isdecimal()):
+                return (), None
+            index = int(names.pop(0))
+        steps.append((field.name, field.has_presence, index))
+        descriptor = field.message_type
+        if descriptor is None:
+            return tuple(steps), None if names else _code(field)
+        if descriptor.full_name in _TIMES and not names:
+            return tuple(steps), "time"
+        if descriptor.GetOptions().map_entry:
+            return (), None
+    return (), None
+
+
+def _protobuf_value(message: Any, column: str, steps: Path_, code: str) -> Any:
+    value = message
+    for name, optional, index in steps:
+        if optional and not value.HasField(name):
+            if code == "d":
+                return np.nan
+            raise Misfit(f"it has no {column!r}")
+        value = getattr(value, name)
+        if index is not None:
+            if index >= len(value):
+                raise ShortArray(column, len(value))
+            value = value[index]
+    return value.seconds * NS + value.nanos if code == "time" else value
+
+
+# -------------------------------------------------------------------------------------------------------------- JSON
+
+
+class JsonExtractor:
+    """Takes wanted numbers out of JSON objects; an `Extractor`. A number left out, or null, is NaN."""
+
+    def __init__(self, wanted: Sequence[str], where: str) -> None:
+        self._wanted, self._where = tuple(wanted), where
+        self._paths = [column.split(".") for column in wanted]
+        self._met: set[str] = set()
+        self._shape: Mapping[str, Any] | None = None
+        self.codes = ["q" for _ in wanted]
+
+    def __call__(self, data: bytes) -> list[Any]:
+        """Return the numbers, in the order of the columns."""
+        try:
+            message = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise Misfit(f"not JSON: {error}") from None
+        if not isinstance(message, dict):
+            raise Misfit(f"not an object but {type(message).__name__}")
+        if self._shape is None:
+            self._shape = message
+        return [self._value(message, column, path) for column, path in zip(self._wanted, self._paths, strict=True)]
+
+    def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return the columns by name.
+
+        Raises:
+            DatasetError: a column that no message has.
+        """
+        for column in self._wanted:
+            if column not in self._met:
+                raise not_held(self._where, "numeric field called", column, _json_fields(self._shape or {}, ""))
+        return dict(zip(self._wanted, raw, strict=True))
+
+    def _value(self, message: Any, column: str, path: Sequence[str]) -> int | float:
+        value = message
+        for name in path:
+            if isinstance(value, dict):
+                value = value.get(name)
+            elif isinstance(value, list) and name.isascii() and name.isdecimal():
+                if int(name) >= len(value):
+                    raise ShortArray(column, len(value))
+                value = value[int(name)]
+            else:
+                return np.nan
+        number = _json_number(value)
+        if number is not None:
+            self._met.add(column)
+            return number
+        if value is not None:
+            raise Misfit(f"{column!r} is no number")
+        return np.nan
+
+
+def _json_number(value: Any) -> int | float | None:
+    """Return a number, or a time's nanoseconds; None where it is neither."""
+    if isinstance(value, int | float):
+        return value if isinstance(value, float) else int(value)
+    if isinstance(value, dict):
+        seconds, nanoseconds = value.get("sec"), value.get("nsec", value.get("nanosec"))
+        if len(value) == 2 and isinstance(seconds, int) and isinstance(nanoseconds, int):
+            return seconds * NS + nanoseconds
+    return None
+
+
+def _json_fields(value: Any, prefix: str) -> Iterator[str]:
+    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    for name, inner in items:
+        if _json_number(inner) is not None:
+            yield f"{prefix}{name}"
+        else:
+            yield from _json_fields(inner, f"{prefix}{name}.")

@@ -1,0 +1,244 @@
+"""Recordings whose messages are topics: ROS bags and MCAP files, read in one pass into compact columns.
+
+A container yields the bytes of one message after another; the message's type says where in them the wanted numbers
+are. Only those are kept, packed side by side, so a recording of any size opens in the memory of its wanted columns.
+"""
+
+from __future__ import annotations
+
+import struct
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DatasetError
+from ..state import TimeArray
+from .recording import Held, Messages, Recording, Wanted, not_held
+
+NS = 1_000_000_000
+
+
+class Misfit(Exception):  # noqa: N818  (a finding about one message, and no error of its own)
+    """The bytes of a message are not what its type says."""
+
+
+class ShortArray(Exception):  # noqa: N818  (the same)
+    """An array of a message ends before the index that is asked for."""
+
+    def __init__(self, path: str, length: int) -> None:
+        super().__init__(f"{path!r} has {length} elements")
+
+
+class Extractor(Protocol):
+    """Takes the wanted numbers out of the bytes of messages of one type."""
+
+    @property
+    def codes(self) -> Sequence[str]:
+        """Return the types of the numbers, as `struct` has them."""
+        ...
+
+    def __call__(self, data: bytes) -> Sequence[Any]:
+        """Return the numbers.
+
+        Raises:
+            Misfit, ShortArray, struct.error: the message does not hold them.
+        """
+        ...
+
+    def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Return the wanted columns, from one array per code."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One writer's messages of one topic.
+
+    Attributes:
+        kind: the name of their type.
+        fields: lists the numeric fields; of an array, its first element.
+        extractor: from wanted columns to what takes them out of a message; `not_held`'s error for an unknown one.
+    """
+
+    topic: str
+    kind: str
+    fields: Callable[[], tuple[str, ...]]
+    extractor: Callable[[Sequence[str]], Extractor]
+
+
+Message = tuple[Channel, tuple[int, ...], bytes]
+"""A channel, the container's stamps (ns), and the bytes."""
+
+
+@dataclass
+class Found:
+    """What a pass over a recording has come upon so far, besides messages."""
+
+    channels: list[Channel] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+class Rows:
+    """Rows of numbers, packed side by side in bytes that grow; no object is kept for a row."""
+
+    def __init__(self, codes: Sequence[str]) -> None:
+        self._codes = list(codes)
+        self._struct = struct.Struct("<" + "".join(codes))
+        self._bytes = bytearray()
+
+    def __len__(self) -> int:
+        return len(self._bytes) // self._struct.size
+
+    def append(self, values: Sequence[Any]) -> None:
+        """Append a row; an integer column that meets a float becomes one of floats."""
+        try:
+            self._bytes += self._struct.pack(*values)
+        except struct.error:
+            self._widen(values)
+            self._bytes += self._struct.pack(*values)
+
+    def arrays(self) -> list[NDArray[Any]]:
+        """Return the columns, (n,) each."""
+        table = np.frombuffer(self._bytes, self._dtype())
+        return [np.array(table[name]) for name in table.dtype.names or ()]
+
+    def _dtype(self) -> np.dtype[Any]:
+        return np.dtype([(f"c{i}", "<" + code) for i, code in enumerate(self._codes)])
+
+    def _widen(self, values: Sequence[Any]) -> None:
+        before = np.frombuffer(bytes(self._bytes), self._dtype())
+        for i, value in enumerate(values):
+            if self._codes[i] == "q" and not (isinstance(value, int) and -(2**63) <= value < 2**63):
+                self._codes[i] = "d"
+        self._struct = struct.Struct("<" + "".join(self._codes))
+        self._bytes = bytearray(before.astype(self._dtype()).tobytes())
+
+
+class TopicRecording(Recording):
+    """A recording of topics; subclasses say how its messages come out of its files."""
+
+    stamps: ClassVar[tuple[str, ...]] = ("log_time",)
+    """Columns that the container adds to every message: int64 ns. The first orders the rows."""
+
+    @abstractmethod
+    def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+        """Yield the messages of these topics (of all where None) in the order of the file; fill `found` on the way.
+
+        Raises:
+            DatasetError: not a recording of this format, or nothing whole in it.
+        """
+
+    def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
+        """Read the topics asked for; see `Recording.read`."""
+        where = str(self.path(folder))
+        for want in wanted:
+            if want.sender is not None:
+                raise DatasetError(f"{where}: {want.message}: topics have no `entity`; leave it out")
+        tables = {want.message: _Table(want, where, self.stamps) for want in wanted}
+        found = Found()
+        for channel, stamps, data in self.messages(folder, tables.keys(), found):
+            tables[channel.topic].add(channel, stamps, data)
+        notes = list(found.notes)
+        for name, table in tables.items():
+            if not table.channels:
+                known = {channel.topic for channel in found.channels}
+                if name in known:
+                    raise DatasetError(f"{where}: no message of {name} in the recording")
+                raise not_held(where, "topic", name, known)
+            notes += table.notes()
+        return Messages([tables[want.message].columns() for want in wanted], tuple(notes))
+
+    def contents(self, folder: Path) -> list[Held]:
+        """Return the topics that the recording holds."""
+        found = Found()
+        spans: dict[str, tuple[Channel, int, int, int]] = {}
+        for channel, stamps, _ in self.messages(folder, None, found):
+            _, count, first, last = spans.get(channel.topic, (channel, 0, stamps[0], stamps[0]))
+            spans[channel.topic] = channel, count + 1, min(first, stamps[0]), max(last, stamps[0])
+        return [
+            Held(topic, channel.kind, count, (last - first) / NS, _fields(channel))
+            for topic, (channel, count, first, last) in sorted(spans.items())
+        ]
+
+
+def _fields(channel: Channel) -> tuple[str, ...]:
+    """Return the numeric fields of a topic; none where its type is not defined, which is an error only when read."""
+    try:
+        return channel.fields()
+    except DatasetError:
+        return ()
+
+
+class _Table:
+    """What is wanted of one topic, and the rows found so far."""
+
+    def __init__(self, want: Wanted, where: str, stamps: tuple[str, ...]) -> None:
+        self.want, self.where, self.stamps = want, f"{where}: {want.message}", stamps
+        self.fields = [column for column in want.columns if column not in stamps]
+        self.channels: dict[Channel, Extractor] = {}
+        self.rows: Rows | None = None
+        self.misfits, self.first_misfit = 0, ""
+
+    def add(self, channel: Channel, stamps: tuple[int, ...], data: bytes) -> None:
+        extract = self.channels.get(channel) or self._opened(channel)
+        rows = self.rows
+        assert rows is not None
+        try:
+            rows.append((*stamps, *extract(data)))
+        except ShortArray as error:
+            row = len(rows) + self.misfits
+            raise DatasetError(f"{self.where}: message {row}: {error}, and more are asked for") from None
+        except (Misfit, struct.error, RecursionError) as error:
+            self.first_misfit = self.first_misfit or f"message {len(rows)}: {error}"
+            self.misfits += 1
+
+    def _opened(self, channel: Channel) -> Extractor:
+        extract = channel.extractor(self.fields)
+        first = next(iter(self.channels), channel)
+        codes = [*["Q"] * len(self.stamps), *extract.codes]
+        if self.rows is None:
+            self.rows = Rows(codes)
+        elif first.kind != channel.kind or list(self.channels[first].codes) != list(extract.codes):
+            raise DatasetError(f"{self.where}: messages of two types, {first.kind} and {channel.kind}")
+        self.channels[channel] = extract
+        return extract
+
+    def notes(self) -> list[str]:
+        """Return what was passed over.
+
+        Raises:
+            DatasetError: most messages do not fit their type.
+        """
+        if not self.misfits:
+            return []
+        assert self.rows is not None
+        kind = next(iter(self.channels)).kind
+        if self.misfits > len(self.rows):
+            count = self.misfits + len(self.rows)
+            raise DatasetError(
+                f"{self.where}: {self.misfits} of {count} messages are not what {kind or 'their type'} is defined as, "
+                f"the first is {self.first_misfit}; is the definition that of the recording?"
+            )
+        return [f"{self.want.message}: {self.misfits} damaged messages passed over, the first is {self.first_misfit}"]
+
+    def columns(self) -> Mapping[str, NDArray[Any]]:
+        """Return the wanted columns, in the order of the container's first stamp."""
+        assert self.rows is not None
+        raw = self.rows.arrays()
+        stamps = dict(zip(self.stamps, map(_signed, raw), strict=False))
+        columns = stamps | next(iter(self.channels.values())).columns(raw[len(self.stamps) :])
+        t_ns = stamps[self.stamps[0]]
+        if (t_ns[1:] < t_ns[:-1]).any():
+            order = np.argsort(t_ns, kind="stable")
+            columns = {name: values[order] for name, values in columns.items()}
+        return {column: columns[column] for column in dict.fromkeys(self.want.columns)}
+
+
+def _signed(values: NDArray[Any]) -> TimeArray:
+    """Return int64 where the values fit; a stamp beyond it is no time, and is told as one further on."""
+    return values.astype(np.int64) if values.max(initial=0) < 2**63 else values

@@ -1,0 +1,76 @@
+"""What a simulated log says of its own making: a sentence for every dial that is not at its default."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from .scenario import Scenario
+from .specs import SENSORS
+
+TOLD = {
+    *("min_range_m", "max_range_m", "max_tilt_deg", "beam_loss_probability", "three_beams"),
+    *("reacquisition_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg"),
+}
+"""Dials of sensors that neither the rig nor the readings show."""
+
+
+def told(scenario: Scenario) -> list[str]:
+    """Return a sentence on the world, on each sensor's dials, delays and faults, where there is anything to say."""
+    return [*_world(scenario), *_biases(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
+
+
+def _world(scenario: Scenario) -> list[str]:
+    return [
+        f"{name}: {listed(dataclasses.asdict(part))}."
+        for name in ("seabed", "waves", "tide")
+        if (part := getattr(scenario, name)) is not None
+    ]
+
+
+def _biases(scenario: Scenario) -> list[str]:
+    correlation_s = scenario.imu_bias_correlation_s
+    return [] if correlation_s is None else [f"imu biases: Gauss–Markov, correlated over {correlation_s:g} s."]
+
+
+def _sensors(scenario: Scenario) -> list[str]:
+    specs = {sensor: getattr(scenario, sensor) for sensor in SENSORS}
+    dials = {s: {n: v for n, v in changed(spec).items() if n in TOLD} for s, spec in specs.items() if spec is not None}
+    return [f"{sensor}: {listed(values)}." for sensor, values in dials.items() if values]
+
+
+def _late(scenario: Scenario) -> list[str]:
+    specs = {sensor: getattr(scenario, sensor) for sensor in SENSORS}
+    return [
+        f"{sensor} comes {spec.delay_s:g} s late, and up to {spec.disorder_s:g} s more, at random."
+        for sensor, spec in specs.items()
+        if spec is not None and (spec.delay_s or spec.disorder_s)
+    ]
+
+
+def _faults(scenario: Scenario) -> list[str]:
+    notes = []
+    for sensor, faults in scenario.faults.items():
+        dials = changed(faults)
+        if faults.outlier_probability:
+            dials |= {name: value for name, value in dataclasses.asdict(faults).items() if "outlier" in name}
+        if dials:
+            notes.append(f"{sensor} faults: {listed(dials)}.")
+    return notes
+
+
+def changed(spec: Any) -> dict[str, Any]:
+    """Return the fields of a spec that differ from their defaults."""
+    fields = dataclasses.fields(spec)
+    return {field.name: getattr(spec, field.name) for field in fields if getattr(spec, field.name) != field.default}
+
+
+def listed(dials: dict[str, Any]) -> str:
+    """Return "name value, name value"."""
+    return ", ".join(f"{name} {_plain(value)}" for name, value in dials.items())
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_plain, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)

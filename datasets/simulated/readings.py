@@ -1,0 +1,127 @@
+"""The simulated aiding sensors: each reads the exact motion through its mounting, with noise of the stated size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..log import DepthStream, DvlStream, GpsStream, HeadingStream, ReadingStream
+from ..quantities import DEGREE
+from ..rig import Mounting
+from ..state import Array, TimeArray
+from .faults import arrives, mar, repeated
+from .janus import read_dvl
+from .motion import Motion
+from .random_streams import random_stream
+from .scenario import Scenario
+from .sea import Sea
+from .specs import DepthSpec, GpsSpec, HeadingSpec, SensorSpec
+
+Kind = TypeVar("Kind", bound=ReadingStream)
+
+ANTENNA_AWASH_M = -0.05
+"""The antenna hears GPS while it is higher than this; a little water over it does not yet drown the signal."""
+WATCH_S = 0.1
+"""How often a receiver that must reacquire looks whether its antenna is awash."""
+
+
+def ticks(rate_hz: float, duration_s: float) -> TimeArray:
+    """Return k / rate_hz for k ≥ 1 up to duration_s, in ns, each rounded by itself."""
+    count = math.floor(duration_s * rate_hz * (1 + 1e-12))
+    return np.rint(np.arange(1, count + 1) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def read(kind: type[Kind], scenario: Scenario, seed: int, motion: Motion) -> Kind | None:
+    """Return one sensor's readings, or None where it is not aboard.
+
+    Noise is drawn for every tick, whether or not it gives a reading.
+    """
+    spec: SensorSpec | None = getattr(scenario, kind.name)
+    if spec is None:
+        return None
+    sensor, faults = kind.name, spec.faults
+    t_ns = ticks(spec.rate_hz, scenario.duration_s)
+    true_s = t_ns * 1e-9 - faults.clock_offset_s
+    z, error, sigma = READ[kind](scenario, spec, scenario.mountings[sensor], motion, true_s, seed)
+    z = mar(z + scenario.noise_scale * error, faults, sensor, seed)
+    heard = np.isfinite(z).all(axis=1) & arrives(t_ns, faults, sensor, seed)
+    rows = repeated(heard, faults, sensor, seed)
+    t_ns, z = scenario.start_ns + t_ns[heard], z[rows]
+    if kind is HeadingStream:
+        z = np.arctan2(np.sin(z), np.cos(z))
+    return kind(t_ns, t_ns + _delays(spec, sensor, heard, seed), z, np.broadcast_to(sigma, error.shape)[rows])
+
+
+def _delays(spec: SensorSpec, sensor: str, heard: NDArray[np.bool_], seed: int) -> TimeArray:
+    """Return how long each reading that is heard is on its way, ns: delay_s, and uniformly up to disorder_s more.
+
+    It is counted from the stamp: a clock that is ahead makes the way look shorter, down to none.
+    """
+    more_s = spec.disorder_s * random_stream(seed, f"{sensor}_disorder").random(len(heard))
+    way_s = np.maximum(spec.delay_s + more_s[heard] - spec.faults.clock_offset_s, 0.0)
+    return np.rint(way_s * 1e9).astype(np.int64)
+
+
+# Each reader returns what the sensor would say without noise (n, k), NaN where it hears nothing, its error (n, k), and
+# its sigma, (k,) or (n, k).
+
+
+def _read_depth(
+    scenario: Scenario, spec: DepthSpec, depth: Mounting, motion: Motion, t_s: Array, seed: int
+) -> tuple[Array, Array, Array]:
+    p_WP_W, sea = _point(motion, depth, t_s), Sea.of(scenario, seed)
+    depth_m = -p_WP_W[:, 2:] if sea is None else sea.rise_m(t_s, p_WP_W)[:, None] - p_WP_W[:, 2:]
+    sigma = np.array([spec.sigma_m])
+    return -spec.faults.scale * depth_m, sigma * random_stream(seed, "depth").standard_normal((len(t_s), 1)), sigma
+
+
+def _read_gps(
+    scenario: Scenario, spec: GpsSpec, gps: Mounting, motion: Motion, t_s: Array, seed: int
+) -> tuple[Array, Array, Array]:
+    p_WG_W = _point(motion, gps, t_s)
+    heard = _afloat(scenario, gps, motion, t_s, seed)
+    if spec.reacquisition_s:
+        watch_s = np.arange(*scenario.reach_s, WATCH_S)
+        awash_s = np.concatenate([[-np.inf], watch_s[~_afloat(scenario, gps, motion, watch_s, seed)]])
+        heard &= t_s - awash_s[np.searchsorted(awash_s, t_s, side="right") - 1] >= spec.reacquisition_s
+    sigma = np.array([spec.horizontal_sigma_m, spec.horizontal_sigma_m, spec.vertical_sigma_m])
+    error = sigma * random_stream(seed, "gps").standard_normal((len(t_s), 3))
+    return np.where(heard[:, None], p_WG_W, np.nan), error, sigma
+
+
+def _afloat(scenario: Scenario, gps: Mounting, motion: Motion, t_s: Array, seed: int) -> NDArray[np.bool_]:
+    """Return when (n,) the antenna is out of the water."""
+    p_WG_W, sea = _point(motion, gps, t_s), Sea.of(scenario, seed)
+    above_m = p_WG_W[:, 2] if sea is None else p_WG_W[:, 2] - sea.rise_m(t_s, p_WG_W * [1, 1, 0])
+    return above_m > ANTENNA_AWASH_M
+
+
+def _read_heading(
+    scenario: Scenario, spec: HeadingSpec, heading: Mounting, motion: Motion, t_s: Array, seed: int
+) -> tuple[Array, Array, Array]:
+    R_WB, _, _ = motion.pose(t_s)
+    x_H_W = R_WB @ heading.R_BS[:, 0]
+    psi = np.arctan2(x_H_W[:, 1:2], x_H_W[:, :1])
+    if spec.soft_iron_deg:
+        psi += spec.soft_iron_deg * DEGREE * np.sin(2 * (psi - spec.soft_iron_axis_deg * DEGREE))
+    psi += spec.bias_deg * DEGREE
+    sigma = np.array([spec.sigma_deg * DEGREE])
+    return psi, sigma * random_stream(seed, "heading").standard_normal((len(t_s), 1)), sigma
+
+
+def _point(motion: Motion, mounting: Mounting, t_s: Array) -> Array:
+    """Return the path p_WS_W (n, 3) of a sensor."""
+    R_WB, p_WB_W, _ = motion.pose(t_s)
+    return p_WB_W + R_WB @ mounting.p_BS_B
+
+
+READ: dict[type[ReadingStream], Callable[..., tuple[Array, Array, Array]]] = {
+    DvlStream: read_dvl,
+    DepthStream: _read_depth,
+    GpsStream: _read_gps,
+    HeadingStream: _read_heading,
+}

@@ -1,0 +1,247 @@
+"""What to simulate: a scenario is frozen, validated and printable, and with a seed it determines a log."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
+from pydantic.dataclasses import dataclass
+
+from ..errors import DatasetError, nearest
+from ..quantities import STRICT, Finite, NotNegative, Positive
+from ..rig import ImuNoise, Mounting, Rig
+from ..state import Array
+from .faults import AnyFaults, DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults, true_mounting
+from .imu_grades import IMU_GRADES
+from .seabed import SeabedSpec
+from .specs import (
+    MISSIONS,
+    RECORDED,
+    SENSORS,
+    DepthSpec,
+    DvlSpec,
+    GpsSpec,
+    HeadingSpec,
+    MountingSpec,
+    PriorSpec,
+    TideSpec,
+    WavesSpec,
+)
+
+CLEARANCE_M = 0.5
+"""Least height of a mission's deepest point above the seabed."""
+
+Imu = Annotated[
+    Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
+    Discriminator(lambda imu: "grade" if isinstance(imu, str) else "figures"),
+]
+
+
+@dataclass(frozen=True, config=STRICT)
+class Scenario:
+    """A mission, a vehicle and its sensors.
+
+    The vehicle starts afloat, surfaces every `surface_every_s` or so, and ends afloat. Depths count from where it
+    floats, down positive; courses from east, counter-clockwise. A sensor that is None is not aboard. A reading comes
+    `delay_s` after it was true, and at random up to `disorder_s` later still, so that readings overtake one another.
+    """
+
+    mission: str = "lawnmower"  # a name in MISSIONS, or "recorded"
+    duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
+    imu: Imu = "tactical"  # a name in IMU_GRADES, or figures of one's own
+
+    # the path
+    speed_mps: Positive = 1.5
+    depth_m: Positive = 20.0  # where level missions run, and yo-yo and helix turn upwards
+    shallow_m: NotNegative = 5.0  # where yo-yo and helix turn downwards
+    climb_deg: Annotated[float, Field(gt=0, le=45)] = 20.0  # of every climb and dive, but the helix's
+    helix_pitch_m: Positive = 10.0  # depth that one turn of the helix gains
+    leg_m: Positive = 100.0
+    turn_radius_m: Positive = 10.0
+    course_deg: Finite = 30.0  # of the first leg
+    surface_every_s: Positive = 270.0
+    surface_for_s: Positive = 36.0  # half of it at the start and at the end
+    wobble_deg: Annotated[float, Field(ge=0, le=10)] = 1.5  # of roll, pitch and yaw, about the path's own
+
+    # a recorded path: east-north-up, its z = 0 at the surface; all but the vehicle and the sensors is then in the file
+    path: str | None = None  # a TUM file; relative to where the command runs
+    path_start_s: NotNegative = 0.0  # when the log begins, after the path's first pose
+    path_spacing_s: Positive | None = None  # between the knots of smoothing splines; None: through every pose
+
+    # the world
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None  # where the Earth turns; None: it does not
+    seabed: SeabedSpec | None = None  # None: always within the DVL's range
+    waves: WavesSpec | None = None  # they move every mission but a recorded one, which has its own in it
+    tide: TideSpec | None = None
+
+    # the vehicle
+    gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
+    imu_mounting: MountingSpec = MountingSpec((180.0, 2.0, 87.0), (-0.35, 0.05, 0.12))
+    depth_mounting: MountingSpec = MountingSpec((0.0, 0.0, 0.0), (0.40, -0.06, 0.05))
+    gps_mounting: MountingSpec = MountingSpec((0.0, 0.0, 0.0), (-0.25, 0.0, 0.30))
+    heading_mounting: MountingSpec = MountingSpec((1.5, -2.0, 4.0), (0.55, 0.0, 0.05))
+
+    # the sensors
+    imu_rate_hz: Positive = 100.0
+    imu_bias_correlation_s: Positive | None = None  # of Gauss–Markov biases; None: they walk
+    imu_faults: ImuFaults = ImuFaults()
+    dvl: DvlSpec | None = DvlSpec()
+    depth: DepthSpec | None = DepthSpec()
+    gps: GpsSpec | None = GpsSpec()
+    heading: HeadingSpec | None = HeadingSpec()
+    prior: PriorSpec = PriorSpec()
+    noise_scale: NotNegative = 1.0  # of every random error, the prior's too; what is stated stays. 0: none
+    start_ns: Annotated[int, Field(ge=0, le=4_000_000_000_000_000_000)] = 0
+
+    @field_validator("mission")
+    @classmethod
+    def _known_mission(cls, name: str) -> str:
+        known = [*MISSIONS, RECORDED]
+        if name not in known:
+            raise ValueError(f"no mission {name!r}{nearest(name, known)}; known: {', '.join(known)}")
+        return name
+
+    @field_validator("imu")
+    @classmethod
+    def _known_grade(cls, imu: str | ImuNoise) -> str | ImuNoise:
+        if isinstance(imu, str) and imu not in IMU_GRADES:
+            raise ValueError(f"no IMU grade {imu!r}{nearest(imu, IMU_GRADES)}; known: {', '.join(IMU_GRADES)}")
+        if isinstance(imu, ImuNoise):
+            for name, value in dataclasses.asdict(imu).items():
+                if not (math.isfinite(value) and (value > 0 or (value == 0 and name.endswith("walk")))):
+                    raise ValueError(f"{name} must be positive and finite, found {value}")
+        return imu
+
+    @model_validator(mode="after")
+    def _saw_has_teeth(self) -> Scenario:
+        if self.mission in MISSIONS and MISSIONS[self.mission].sawtooth and self.shallow_m >= self.depth_m:
+            raise ValueError(f"{self.mission}: shallow_m {self.shallow_m} must be less than depth_m {self.depth_m}")
+        return self
+
+    @model_validator(mode="after")
+    def _helix_climbs_gently(self) -> Scenario:
+        if self.mission == "helix" and self.helix_pitch_m > 2 * math.pi * self.turn_radius_m:
+            raise ValueError(
+                f"helix: helix_pitch_m {self.helix_pitch_m:g} climbs at more than 45°; at most 2π · turn_radius_m"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _stays_off_the_ground(self) -> Scenario:
+        if self.mission in MISSIONS and self.seabed is not None:
+            shallowest_m = self.seabed.depth_m - self.seabed.relief_m
+            if self.depth_m + CLEARANCE_M > shallowest_m:
+                raise ValueError(
+                    f"a seabed {shallowest_m:g} m deep must be {CLEARANCE_M:g} m below depth_m {self.depth_m:g}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _only_the_recorded_mission_has_a_path(self) -> Scenario:
+        if self.path is not None and self.mission != RECORDED:
+            raise ValueError(f"mission {self.mission} takes no `path`; only mission {RECORDED!r} follows one")
+        return self
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], source: str = "scenario") -> Scenario:
+        """Build a scenario from what a file says.
+
+        Raises:
+            DatasetError: naming source, key, what is wrong, and for an unknown key its nearest known neighbour.
+        """
+        if not isinstance(values, Mapping):
+            raise DatasetError(f"{source}: expected a mapping of keys, found {values!r}")
+        if values.get("mission") == RECORDED and values.get("path") is None:
+            raise DatasetError(f"{source}: mission {RECORDED!r} needs `path`, a TUM file")
+        try:
+            return cls(**{str(key): value for key, value in values.items()})
+        except ValidationError as error:
+            errors = error.errors()  # a misspelt key is also a missing one: tell of the spelling
+            first = min(errors, key=lambda e: e["type"] != "unexpected_keyword_argument")
+            path = [str(part) for part in first["loc"] if part not in ("grade", "figures")]
+            where = ": ".join([source, ".".join(path)] if path else [source])
+            if first["type"] == "unexpected_keyword_argument":
+                known = _fields_at(path[:-1])
+                raise DatasetError(
+                    f"{where}: unknown key{nearest(path[-1], known)}; known: {', '.join(known)}"
+                ) from None
+            what = first["msg"].removeprefix("Value error, ")
+            found = "" if first["type"] == "value_error" else f", found {first['input']!r}"
+            raise DatasetError(f"{where}: {what}{found}") from None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Inverse of `from_dict`: plain values, ready for YAML."""
+        return dataclasses.asdict(self)
+
+    @property
+    def faults(self) -> dict[str, AnyFaults]:
+        """The faults of the IMU and of every aiding sensor aboard, by sensor name."""
+        aboard = {sensor: getattr(self, sensor) for sensor in SENSORS}
+        return {"imu": self.imu_faults} | {name: spec.faults for name, spec in aboard.items() if spec is not None}
+
+    @property
+    def reach_s(self) -> tuple[float, float]:
+        """From when to when the sensors look at the motion, from the log's start; a wrong clock looks elsewhere."""
+        offsets_s = [faults.clock_offset_s for faults in self.faults.values()]
+        return -max(0.0, *offsets_s), self.duration_s - min(0.0, *offsets_s)
+
+    @property
+    def imu_noise(self) -> ImuNoise:
+        """The figures behind `imu`."""
+        return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
+
+    @property
+    def earth_rate_radps(self) -> Array:
+        """Angular rate of the Earth, (3,) in W axes; zero where it does not turn."""
+        return np.zeros(3) if self.latitude_deg is None else self.rig.w_CW_W
+
+    @property
+    def rig(self) -> Rig:
+        """What the estimators are told of the vehicle."""
+        return Rig(
+            imu_noise=self.imu_noise,
+            imu=self.imu_mounting.mounting(),
+            depth=self.depth_mounting.mounting(),
+            gps=self.gps_mounting.mounting(),
+            heading=self.heading_mounting.mounting(),
+            gravity=self.gravity_mps2,
+            latitude_deg=self.latitude_deg,
+        )
+
+    @property
+    def mountings(self) -> dict[str, Mounting]:
+        """Where the IMU and the sensors aboard really sit, by sensor name: the rig's word and their faults."""
+        rig = self.rig
+        stated = {"imu": rig.imu, "dvl": Mounting(), "depth": rig.depth, "gps": rig.gps, "heading": rig.heading}
+        return {sensor: true_mounting(stated[sensor], faults) for sensor, faults in self.faults.items()}
+
+
+NESTED = {
+    "dvl": DvlSpec,
+    "dvl.faults": DvlFaults,
+    "depth": DepthSpec,
+    "depth.faults": DepthFaults,
+    "gps": GpsSpec,
+    "gps.faults": GpsFaults,
+    "heading": HeadingSpec,
+    "heading.faults": HeadingFaults,
+    "imu_faults": ImuFaults,
+    "seabed": SeabedSpec,
+    "waves": WavesSpec,
+    "tide": TideSpec,
+    "prior": PriorSpec,
+    "imu": ImuNoise,
+    "imu_mounting": MountingSpec,
+    "depth_mounting": MountingSpec,
+    "gps_mounting": MountingSpec,
+    "heading_mounting": MountingSpec,
+}
+
+
+def _fields_at(path: list[str]) -> list[str]:
+    """Return the keys known below a key of the scenario, or at its top."""
+    return [field.name for field in dataclasses.fields(NESTED[".".join(path)] if path else Scenario)]

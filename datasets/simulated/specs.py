@@ -1,0 +1,162 @@
+"""The parts of a scenario, as a file states them: missions, sea, mountings, sensors and the prior, each validated."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import Rotation
+
+from ..quantities import STRICT, Finite, NotNegative, Positive, Probability, Vector
+from ..rig import Mounting
+from .faults import DepthFaults, DvlFaults, GpsFaults, HeadingFaults
+
+STEEPEST = 1 / 15
+"""Significant height over the length of the peak's wave: steeper seas break."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What tells one mission from another.
+
+    Attributes:
+        turns_deg: course changes, over and over; counter-clockwise positive.
+        sawtooth: whether the vehicle keeps climbing and diving between two depths, or runs level at the deeper.
+        legs: whether a straight leg comes before each course change; without, the vehicle climbs by the turn.
+    """
+
+    turns_deg: tuple[float, ...]
+    sawtooth: bool = False
+    legs: bool = True
+
+
+MISSIONS = {
+    "lawnmower": Plan(turns_deg=(180.0, -180.0)),
+    "yo-yo": Plan(turns_deg=(70.0, -100.0, 60.0, -30.0), sawtooth=True),
+    "helix": Plan(turns_deg=(360.0,), sawtooth=True, legs=False),
+    "box": Plan(turns_deg=(90.0,)),
+    "transit": Plan(turns_deg=(0.0,)),
+}
+
+
+RECORDED = "recorded"
+"""The mission whose path is a trajectory of somebody's."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class WavesSpec:
+    """A sea state: significant height, period of the spectrum's peak, and where the waves run (from east, to north)."""
+
+    height_m: Positive = 0.5
+    period_s: Annotated[float, Field(ge=4, le=30)] = 6.0
+    towards_deg: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _not_breaking(self) -> WavesSpec:
+        length_m = 9.81 * self.period_s**2 / (2 * math.pi)
+        if self.height_m > STEEPEST * length_m:
+            raise ValueError(
+                f"waves {self.height_m:g} m high and {length_m:.3g} m long break; height_m at most "
+                f"{STEEPEST * length_m:.2g} for period_s {self.period_s:g}"
+            )
+        return self
+
+
+@dataclass(frozen=True, config=STRICT)
+class TideSpec:
+    """A rise and fall of the water, from z = 0 at the log's start; its phase there is 0 where it rises fastest."""
+
+    amplitude_m: Positive = 1.0
+    period_h: Positive = 12.42
+    phase_deg: Finite = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class MountingSpec:
+    """Where a sensor S sits: R_BS = Rz(yaw) Ry(pitch) Rx(roll), and its lever arm in B."""
+
+    roll_pitch_yaw_deg: Vector = (0.0, 0.0, 0.0)
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+
+    def mounting(self) -> Mounting:
+        """Return it as the rig knows it."""
+        R_BS = Rotation.from_euler("xyz", self.roll_pitch_yaw_deg, degrees=True).as_matrix()
+        return Mounting(R_BS, np.array(self.lever_arm_m))
+
+
+@dataclass(frozen=True, config=STRICT)
+class DvlSpec:
+    """Four-beam Janus DVL at B. 5 mm/s per beam: Nortek DVL1000, RDI WHN600; 22.5° and 0.05–50 m: Water Linked A50."""
+
+    rate_hz: Positive = 5.0
+    beam_sigma_mps: Positive = 0.005
+    beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
+    min_range_m: NotNegative = 0.05  # along each beam, where there is a seabed
+    max_range_m: Positive = 50.0
+    max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] | None = None  # of its axis from the vertical
+    beam_loss_probability: Probability = 0.0  # of each beam of each reading
+    three_beams: bool = True  # whether three beams are enough for a reading
+    delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
+    faults: DvlFaults = DvlFaults()
+
+
+@dataclass(frozen=True, config=STRICT)
+class DepthSpec:
+    """Pressure sensor. The Bar30 resolves 2 mm; sigma covers swell and air pressure as well."""
+
+    rate_hz: Positive = 10.0
+    sigma_m: Positive = 0.02
+    delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
+    faults: DepthFaults = DepthFaults()
+
+
+@dataclass(frozen=True, config=STRICT)
+class GpsSpec:
+    """GPS, heard only while the antenna is out of the water. 1–5 m is what receivers give without corrections."""
+
+    rate_hz: Positive = 1.0
+    horizontal_sigma_m: Positive = 1.5
+    vertical_sigma_m: Positive = 3.0
+    reacquisition_s: NotNegative = 0.0  # from when the antenna leaves the water to the first fix; it begins with one
+    delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
+    faults: GpsFaults = GpsFaults()
+
+
+@dataclass(frozen=True, config=STRICT)
+class HeadingSpec:
+    """Magnetic heading, 1–2° after calibration. No estimator is told of its bias, nor of soft iron.
+
+    Soft iron adds soft_iron_deg · sin 2(ψ − soft_iron_axis_deg): the quadrantal deviation of a compass.
+    """
+
+    rate_hz: Positive = 5.0
+    sigma_deg: Positive = 1.0
+    bias_deg: Finite = 0.0
+    soft_iron_deg: NotNegative = 0.0
+    soft_iron_axis_deg: Finite = 0.0
+    delay_s: NotNegative = 0.0
+    disorder_s: NotNegative = 0.0
+    faults: HeadingFaults = HeadingFaults()
+
+
+SensorSpec = DvlSpec | DepthSpec | GpsSpec | HeadingSpec
+
+
+SENSORS = ("dvl", "depth", "gps", "heading")
+"""The aiding sensors, by the names of their streams and specs."""
+
+
+@dataclass(frozen=True, config=STRICT)
+class PriorSpec:
+    """Standard deviations of the belief at the start; those of the biases are the IMU's at turn-on."""
+
+    attitude_deg: Positive = 0.5  # each of the three axes of B
+    position_m: Positive = 1.0
+    velocity_mps: Positive = 0.05

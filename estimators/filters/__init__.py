@@ -1,0 +1,1 @@
+"""Kalman filters: eskf, eskf-filterpy, iekf, ukf, and the rts smoother on top of eskf."""

@@ -1,0 +1,213 @@
+"""One pass of any filter of ours: from epoch to epoch, past outliers, and back where a reading comes late.
+
+What a filter does within an epoch is a `Kalman`: it predicts and corrects. All that goes on around it is here, once, so
+that filters differ in their filtering alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from ...datasets.epochs import SENSOR, Epoch
+from ...datasets.rig import Rig
+from ...datasets.state import Array, Belief
+from ...datasets.trajectory import Trajectory
+from ..interface import FACTORS, Diverged, Factors, Gate, Inflation
+from ..physics.imu import BLOCK, compile_rig, first_sample
+from ..physics.innovation import INNOVATION, gate_widths, judge
+from ..physics.records import as_belief, as_record, split, with_rate_noise
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """What every filter can be told.
+
+    Attributes:
+        factors: the sensors it may use.
+        inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
+        gate: probability by sensor, such as {gps: 0.999}. A reading whose normalised innovation squared, against the
+            state predicted before any reading of its epoch, is beyond that quantile of chi-square is left out and
+            counted. A filter that has gone wrong leaves out good readings too, and may never find back.
+        max_delay_s: how far back it can go for a late reading.
+        merge_ns: a reading at most this much older than its epoch is taken as of its epoch, and counted.
+        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
+    """
+
+    factors: Factors = FACTORS
+    inflate: Inflation = Field(default_factory=dict)
+    gate: Gate = Field(default_factory=dict)
+    max_delay_s: float = Field(default=5.0, ge=0, allow_inf_nan=False)
+    merge_ns: int = Field(default=1_000_000, ge=0)
+    earth_rotation: bool = False
+
+
+class Kalman(ABC):
+    """What makes a filter: how it carries a STATE record (of length 1) over a motion, and corrects it, in place.
+
+    Its P may be of any error it likes, as long as it can be said in ours. Either step may raise Diverged.
+    """
+
+    @abstractmethod
+    def predict(
+        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
+    ) -> None:
+        """Carry the state over IMU_SAMPLE rows; `before` is the one before them. Fills `block` with their motion."""
+
+    @abstractmethod
+    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
+        """Correct by readings that are all true now; False where that is impossible."""
+
+    def error_covariance(self, state: NDArray[Any]) -> Array:
+        """Return the covariance (15, 15) of our error state: P itself, unless the filter's error is another."""
+        return state["P"][0]
+
+
+class Lived(NamedTuple):
+    """An epoch that has been lived through, the state and the sample before it, and what the gates left out of it."""
+
+    epoch: Epoch
+    state: NDArray[Any]
+    before: NDArray[Any]
+    outliers: Counter[str]
+
+
+class FilterPass:
+    """One pass of a filter.
+
+    A reading that comes late, by at most max_delay_s, is put where it belongs: the filter goes back to the state it had
+    then and lives through the epochs since once more. One that comes later still is counted and left out.
+
+    Args:
+        config, prior, rig: as for `Estimator.begin`; the prior's P is already of the filter's own error.
+        kalman: the filter.
+        lived: told of every epoch once it has been lived through, with the state at its end and the block that led
+            there; of those lived again, again.
+    """
+
+    def __init__(
+        self,
+        config: FilterOptions,
+        prior: Belief,
+        rig: Rig,
+        kalman: Kalman,
+        lived: Callable[[Epoch, NDArray[Any], NDArray[Any]], None] | None = None,
+    ) -> None:
+        self.counts: Counter[str] = Counter({f"outliers_{sensor}": 0 for sensor in config.gate})
+        self._config = config
+        self._kalman = kalman
+        self._lived = lived
+        self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
+        self._widths = gate_widths(config.gate) if config.gate else None
+        self._t_ns = prior.t_ns
+        self._state = as_record(prior)
+        self._before: NDArray[Any] | None = None
+        self._block = np.zeros(1, BLOCK)
+        self._past: deque[Lived] = deque()
+
+    @property
+    def rig(self) -> NDArray[Any]:
+        """The rig as one RIG record."""
+        return self._rig
+
+    def step(self, epoch: Epoch) -> None:
+        """See `Pass.step`."""
+        # an epoch's readings stand in the order of their truth
+        if len(epoch.readings) and epoch.readings["t_ns"][0] != epoch.t_ns:
+            age_ns = epoch.t_ns - epoch.readings["t_ns"]
+            self.counts["merged"] += int(((age_ns > 0) & (age_ns <= self._config.merge_ns)).sum())
+            if age_ns[0] > self._config.merge_ns:
+                epoch = self._go_back_for_late(epoch)
+        self._live(epoch)
+
+    def belief(self) -> Belief:
+        """See `Pass.belief`."""
+        state = as_belief(self._t_ns, self._state).state
+        return with_rate_noise(Belief(self._t_ns, state, self._kalman.error_covariance(self._state)), self._rig)
+
+    def finish(self) -> Trajectory | None:
+        """A filter has no hindsight."""
+        return None
+
+    def _live(self, epoch: Epoch) -> None:
+        """Predict to the epoch's end, correct by its readings, and remember."""
+        if self._before is None:
+            self._before = first_sample(epoch.imu, self._rig)
+        outliers: Counter[str] = Counter()
+        if self._config.max_delay_s > 0:
+            self._past.append(Lived(epoch, self._state.copy(), self._before, outliers))
+            horizon_ns = epoch.t_ns - int(self._config.max_delay_s * 1e9)
+            while self._past[0].epoch.t_ns < horizon_ns:
+                self._past.popleft()
+        if len(epoch.imu):
+            self._kalman.predict(self._state, self._rig, self._before, epoch.imu, self._block)
+            self._before = epoch.imu[-1:]
+        readings = epoch.readings
+        if self._widths is not None and len(readings):
+            readings = self._likely(readings, self._widths, outliers)
+            self.counts.update(outliers)
+        if len(readings) and not self._kalman.correct(self._state, self._rig, readings):
+            raise Diverged("the innovation covariance is not positive, or the state is not finite")
+        if self._lived is not None:
+            self._lived(epoch, self._state, self._block)
+        self._t_ns = epoch.t_ns
+
+    def _likely(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
+        """Return the readings that pass their gates, and count the others."""
+        predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
+        predicted["P"][0] = self._kalman.error_covariance(self._state)
+        judge(readings, predicted, self._rig, table)
+        beyond = table["nis"] > widths[readings["kind"], table["dof"]]
+        if not beyond.any():
+            return readings
+        outliers.update(f"outliers_{SENSOR[kind]}" for kind in readings["kind"][beyond].tolist())
+        return readings[~beyond]
+
+    def _go_back_for_late(self, epoch: Epoch) -> Epoch:
+        """Live through the past again with the epoch's late readings in it; return the epoch without them."""
+        is_late = epoch.readings["t_ns"] < epoch.t_ns - self._config.merge_ns
+        late = epoch.readings[is_late]
+        late = late[np.argsort(late["t_ns"], kind="stable")]
+        now = Lived(epoch._replace(readings=epoch.readings[~is_late]), self._state, self._before_or(epoch), Counter())
+        past = [*self._past, now]
+        began_ns = past[0].epoch.t_ns - round(float(past[0].epoch.imu["dt_s"].sum()) * 1e9)
+        reachable = late[late["t_ns"] > began_ns]
+        self.counts["late"] += len(late) - len(reachable)
+        self.counts["replayed"] += len(reachable)
+        if len(reachable):
+            first = next(i for i, lived in enumerate(past) if lived.epoch.t_ns >= reachable["t_ns"][0])
+            again = [lived.epoch for lived in past[first:]]
+            if first < len(past) - 1:
+                self._state, self._before = past[first].state.copy(), past[first].before
+            for _ in again[:-1]:
+                self.counts.subtract(self._past.pop().outliers)
+            for reading in reachable:
+                again = _insert(again, reading)
+            for lived_again in again[:-1]:
+                self._live(lived_again)
+            return again[-1]
+        return now.epoch
+
+    def _before_or(self, epoch: Epoch) -> NDArray[Any]:
+        return first_sample(epoch.imu, self._rig) if self._before is None else self._before
+
+
+def _insert(epochs: list[Epoch], reading: Any) -> list[Epoch]:
+    """Return the epochs with `reading` in the last one of its time, splitting the one that it falls into."""
+    t_ns = int(reading["t_ns"])
+    same_time = [i for i, epoch in enumerate(epochs) if epoch.t_ns == t_ns]
+    k = same_time[-1] if same_time else next(i for i, epoch in enumerate(epochs) if epoch.t_ns > t_ns)
+    epoch, row = epochs[k], np.array([reading])
+    if epoch.t_ns == t_ns:
+        split_up = [epoch._replace(readings=np.concatenate([epoch.readings, row]))]
+    else:
+        head, tail = split(epoch.imu, t_ns)
+        split_up = [Epoch(t_ns, head, row, False), epoch._replace(imu=tail)]
+    return [*epochs[:k], *split_up, *epochs[k + 1 :]]

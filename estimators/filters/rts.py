@@ -1,0 +1,255 @@
+"""Rauch–Tung–Striebel: the error-state Kalman filter forwards, then backwards over the whole log.
+
+Source: Rauch, Tung & Striebel 1965, doi:10.2514/3.3166, on the manifold. With x_k the filtered state of epoch k, P_k
+its covariance, x⁻ = f(x_k) and P⁻ = F P_k Fᵀ + Q the prediction of epoch k + 1, and S for what is smoothed:
+
+    G = P_k Fᵀ (P⁻)⁻¹        d = G Log(x⁻, x^S_k+1)        x^S_k = x_k ⊕ d
+    P^S_k = P_k + G (P^S_k+1 − P⁻) Gᵀ
+
+Here P⁻ and P_k are of errors at x⁻ and x_k (the filter has settled its own reset when it handed P_k on); P^S_k+1 is of
+errors at x^S_k+1, so it is carried to x⁻ by the inverse right Jacobian of the step between them, and P^S_k from x_k to
+x^S_k by the right Jacobian of d.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic.dataclasses import dataclass
+
+from ...datasets.epochs import Epoch
+from ...datasets.rig import Rig
+from ...datasets.state import DIM, THETA, Array, Belief
+from ...datasets.trajectory import Trajectory
+from ..interface import Diverged
+from ..physics.imu import BLOCK, STATE, predict, process_noise, sandwich
+from ..physics.records import as_belief, as_record, with_rate_noise
+from ..physics.so3 import inverse_right_jacobian, log, product
+from .eskf import ErrorStateKalman, inject
+from .filter_pass import FilterOptions, FilterPass
+
+TRIANGLE = DIM * (DIM + 1) // 2
+PAGE = 1024
+"""Epochs for which memory is taken at a time."""
+
+
+class Page:
+    """What is remembered of up to PAGE epochs, 2.4 kB each: F, Q and the prediction are found again from the block."""
+
+    def __init__(self) -> None:
+        self.t_ns = np.zeros(PAGE, np.int64)
+        self.tick = np.zeros(PAGE, np.bool_)
+        self.mean = np.zeros((PAGE, 21))  # the filtered state: R_WB, p_WB_W, v_WB_W, b_a, b_g
+        self.P = np.zeros((PAGE, TRIANGLE))  # its covariance, the lower triangle by rows
+        self.block = np.zeros(PAGE, BLOCK)  # the motion that led to it
+
+
+@dataclass(frozen=True)
+class RauchTungStriebelSmoother(FilterOptions):
+    """`eskf` forwards, and backwards at the end; its beliefs on the way are those of `eskf`."""
+
+    def begin(self, prior: Belief, rig: Rig) -> RauchTungStriebelPass:
+        """See `Estimator.begin`."""
+        return RauchTungStriebelPass(self, prior, rig)
+
+
+class RauchTungStriebelPass:
+    """One pass of `RauchTungStriebelSmoother`."""
+
+    def __init__(self, config: RauchTungStriebelSmoother, prior: Belief, rig: Rig) -> None:
+        self._forwards = FilterPass(config, prior, rig, ErrorStateKalman(), self._remember_epoch)
+        self.counts = self._forwards.counts
+        self._pages: list[Page] = []
+        self._length = 0
+        self._remember(prior.t_ns, False, as_record(prior), STANDSTILL)
+
+    def step(self, epoch: Epoch) -> None:
+        """See `Pass.step`."""
+        self._forwards.step(epoch)
+
+    def belief(self) -> Belief:
+        """See `Pass.belief`."""
+        return self._forwards.belief()
+
+    def finish(self) -> Trajectory | None:
+        """Return the smoothed states at the ticks; what the forward pass took of memory is given back on the way."""
+        beliefs: list[Belief] = []
+        later, block, rig = np.zeros(1, STATE), STANDSTILL.copy(), self._forwards.rig
+        filled = self._length - PAGE * (len(self._pages) - 1)
+        recall(self._pages[-1].mean, self._pages[-1].P, filled - 1, later)
+        while self._pages:
+            page = self._pages.pop()
+            ticks = np.flatnonzero(page.tick[:filled])
+            smoothed = np.zeros(len(ticks), STATE)
+            if not smooth(page.mean, page.P, page.block, filled, page.tick, later, block, rig, smoothed):
+                raise Diverged("a predicted covariance is not positive")
+            for k in range(len(ticks) - 1, -1, -1):
+                belief = as_belief(int(page.t_ns[ticks[k]]), smoothed[k : k + 1])
+                beliefs.append(with_rate_noise(belief, rig))
+            filled = PAGE
+        self._length = 0
+        return Trajectory.from_beliefs(beliefs[::-1], lookahead_s=np.inf)
+
+    def _remember_epoch(self, epoch: Epoch, state: NDArray[Any], block: NDArray[Any]) -> None:
+        """Write an epoch down; where nothing moved since the last one, as the same, later known better."""
+        t_ns, tick = epoch.t_ns, epoch.tick
+        if not len(epoch.imu):
+            self._forget(t_ns + 1)
+            page, row = self._pages[-1], (self._length - 1) % PAGE
+            block, tick = page.block[row : row + 1].copy(), tick or bool(page.tick[row])
+        self._remember(t_ns, tick, state, block)
+
+    def _remember(self, t_ns: int, tick: bool, state: NDArray[Any], block: NDArray[Any]) -> None:
+        """Write a state down; where the filter has gone back for a late reading, over those that it lives again."""
+        self._forget(t_ns)
+        row = self._length % PAGE
+        if row == 0:
+            self._pages.append(Page())
+        page = self._pages[-1]
+        page.t_ns[row], page.tick[row], page.block[row] = t_ns, tick, block[0]
+        keep(state, row, page.mean, page.P)
+        self._length += 1
+
+    def _forget(self, t_ns: int) -> None:
+        """Strike out what was written down of t_ns and later."""
+        while self._length and self._pages[-1].t_ns[(self._length - 1) % PAGE] >= t_ns:
+            self._length -= 1
+            if self._length % PAGE == 0:
+                self._pages.pop()
+
+
+STANDSTILL = np.zeros(1, BLOCK)
+"""The block of no motion in no time."""
+STANDSTILL["dR"] = np.eye(3)
+
+
+@njit(cache=True)
+def keep(state: NDArray[Any], row: int, mean: Array, P: Array) -> None:
+    """Write a STATE record into one row of a page."""
+    s, n = state[0], 0
+    for i in range(3):
+        for j in range(3):
+            mean[row, 3 * i + j] = s.R_WB[i, j]
+        mean[row, 9 + i], mean[row, 12 + i] = s.p_WB_W[i], s.v_WB_W[i]
+        mean[row, 15 + i], mean[row, 18 + i] = s.b_a[i], s.b_g[i]
+    for i in range(DIM):
+        for j in range(i + 1):
+            P[row, n] = s.P[i, j]
+            n += 1
+
+
+@njit(cache=True)
+def recall(mean: Array, P: Array, row: int, state: NDArray[Any]) -> None:
+    """Inverse of `keep`."""
+    s, n = state[0], 0
+    for i in range(3):
+        for j in range(3):
+            s.R_WB[i, j] = mean[row, 3 * i + j]
+        s.p_WB_W[i], s.v_WB_W[i] = mean[row, 9 + i], mean[row, 12 + i]
+        s.b_a[i], s.b_g[i] = mean[row, 15 + i], mean[row, 18 + i]
+    for i in range(DIM):
+        for j in range(i + 1):
+            s.P[i, j] = s.P[j, i] = P[row, n]
+            n += 1
+
+
+@njit(cache=True)
+def smooth(
+    mean: Array, P: Array, blocks: NDArray[Any], filled: int, tick: NDArray[np.bool_],
+    later: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], out: NDArray[Any],
+) -> bool:  # fmt: skip
+    """Smooth the epochs of one page, from the last to the first; False where that is impossible.
+
+    Args:
+        mean, P, blocks, tick: the page's, of which the first `filled` rows count.
+        later: STATE record of length 1, the smoothed state after the page's last; replaced by that of its first.
+        block: BLOCK record of length 1, the motion that leads to `later`; likewise.
+        rig: RIG record of length 1.
+        out: STATE records, filled with the smoothed states of the ticks.
+    """
+    wanted = len(out)
+    ahead = later.copy()
+    for row in range(filled - 1, -1, -1):
+        now = ahead.copy()
+        recall(mean, P, row, now)
+        if not smooth_one(now, later, block, rig[0].gravity, ahead):
+            return False
+        later[0] = now[0]
+        block[0] = blocks[row]
+        if tick[row]:
+            wanted -= 1
+            out[wanted] = now[0]
+    return True
+
+
+@njit(cache=True)
+def smooth_one(
+    now: NDArray[Any], later: NDArray[Any], block: NDArray[Any], gravity: float, ahead: NDArray[Any]
+) -> bool:
+    """Smooth `now`, in place, given the smoothed state `later` and the block between; `ahead` is scratch."""
+    s, e, a = now[0], later[0], ahead[0]
+    F, Q, d = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty(DIM)
+    predict(block, now, gravity, F, ahead)
+    process_noise(block, s.R_WB, Q)
+    P_ahead = sandwich(F, s.P) + Q
+
+    d[THETA] = log(product(a.R_WB.T, e.R_WB))
+    for i in range(3):
+        d[3 + i], d[6 + i] = e.p_WB_W[i] - a.p_WB_W[i], e.v_WB_W[i] - a.v_WB_W[i]
+        d[9 + i], d[12 + i] = e.b_a[i] - a.b_a[i], e.b_g[i] - a.b_g[i]
+    J, gained = inverse_right_jacobian(d[THETA]), e.P.copy()
+    gained[THETA, :] = J @ np.ascontiguousarray(gained[THETA, :])
+    gained[:, THETA] = np.ascontiguousarray(gained[:, THETA]) @ J.T
+    gained -= P_ahead
+
+    FP = F @ s.P
+    G = np.empty((DIM, DIM))
+    if not divide(P_ahead, FP, G):
+        return False
+    s.P[:] += G @ gained @ G.T
+    inject(now, G @ d)
+    return True
+
+
+@njit(cache=True)
+def divide(P: Array, A: Array, G: Array) -> bool:
+    """Fill G = Aᵀ P⁻¹ for a covariance P, by Cholesky of its correlations; False where P is none.
+
+    What has no variance, or none of its own, is left out of the inverse: there is nothing to smooth there.
+    """
+    n = len(P)
+    L, scale = np.zeros((n, n)), np.empty(n)
+    for i in range(n):
+        if not P[i, i] >= 0.0:
+            return False
+        scale[i] = 1.0 / math.sqrt(P[i, i]) if P[i, i] > 0.0 else 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            total = P[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = total / L[j, j] if L[j, j] > 0.0 else 0.0
+            elif not total > -1e-9:
+                return False
+            else:
+                L[i, i] = math.sqrt(total) if total > 1e-14 else 0.0
+    x = np.empty(n)
+    for column in range(n):
+        for i in range(n):
+            total = A[i, column] * scale[i]
+            for k in range(i):
+                total -= L[i, k] * x[k]
+            x[i] = total / L[i, i] if L[i, i] > 0.0 else 0.0
+        for i in range(n - 1, -1, -1):
+            total = x[i]
+            for k in range(i + 1, n):
+                total -= L[k, i] * x[k]
+            x[i] = total / L[i, i] if L[i, i] > 0.0 else 0.0
+        for i in range(n):
+            G[column, i] = x[i] * scale[i]
+    return True

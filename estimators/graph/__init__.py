@@ -1,0 +1,1 @@
+"""Smoothers on GTSAM's factor graphs; the only folder that imports gtsam."""

@@ -1,0 +1,367 @@
+"""The border with GTSAM: keys, tangents, and our physics as its factors.
+
+GTSAM's pose tangent is (rotation, translation in B) and its bias stands in B axes, since it is fed with samples in B.
+Everything is converted here and nowhere else.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numba import njit
+from numpy.typing import NDArray
+
+from ...datasets.epochs import ATTITUDE, DEPTH, GPS, HEADING
+from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
+from ..interface import Diverged
+from ..physics.dvl_preintegration import given_rotation
+from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, STATE, predict, process_noise, unbiased
+from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
+from ..physics.so3 import cross, exp, inverse_right_jacobian, inverse_transform, log, product, right_jacobian, transform
+
+NO_BLOCK = np.zeros(1, BLOCK)
+ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
+LEAST_WALK = 1e-4
+"""1/s: a bias must walk for GTSAM; by this much of the white noise nobody notices."""
+INTEGRATION_DENSITY = 1e-5
+"""m/√s: GTSAM wants some; ten micrometres in a second keep a block of one sample regular."""
+
+
+@njit(cache=True)
+def equivalent_samples(
+    imu: NDArray[Any], before: NDArray[Any], rig: NDArray[Any], block: NDArray[Any]
+) -> tuple[Array, Array, Array]:
+    """Samples that GTSAM's tangent preintegration turns into exactly the motion of `block` (`imu.integrate`).
+
+    GTSAM sums theta += J_r⁻¹(theta) w dt, Δv += ΔR f dt and Δp += Δv dt + ½ ΔR f dt². So w is the step of Log ΔR
+    through J_r, and f dt the push with coning, sculling and the lever arm's ω₀ × l − ΔR₁ (ω₁ × l), which telescopes.
+    What the sum then lacks of Δp goes as one more push at the start and its opposite at the end.
+
+    Args:
+        imu, before, rig: what the block was integrated from.
+        block: BLOCK record of length 1.
+
+    Returns:
+        accel (n, 3) m/s², gyro (n, 3) rad/s in B axes, the block's biases put back in; dt (n,) s.
+    """
+    g, b, n = rig[0], block[0], len(imu)
+    rates, forces, dts = unbiased(imu, before, b.b_a, b.b_g, g.R_BI)
+    accel, gyro = np.empty((n, 3)), np.empty((n, 3))
+    R, theta, v, p = np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    R_last = R
+    for k in range(n):
+        dt, w0, f0, w, f = dts[k + 1], rates[k], forces[k], rates[k + 1], forces[k + 1]
+        slope = dt**3 / (6.0 * (dts[k] + dt))
+        turn = exp(dt * w + slope * cross(w0, w))
+        w_x_f = cross(w, f)
+        push = dt * f + 0.5 * dt**2 * w_x_f + dt**3 / 6.0 * cross(w, w_x_f) + slope * (cross(w0, f) + cross(f0, w))
+        push += cross(w0, g.p_BI_B) - transform(turn, cross(w, g.p_BI_B))
+        dv = transform(R, push)
+        p += dt * v + 0.5 * dt * dv
+        v += dv
+        R_last, R = R, product(R, turn)
+        gyro[k] = transform(right_jacobian(theta), log(R) - theta) / dt
+        accel[k] = push / dt
+        theta = log(R)
+    if n > 1:
+        lacking = (b.dp - p) / (b.T - 0.5 * (dts[1] + dts[n]))
+        accel[0] += lacking / dts[1]
+        accel[n - 1] -= inverse_transform(R_last, lacking) / dts[n]
+    return accel + transform(g.R_BI, b.b_a), gyro + transform(g.R_BI, b.b_g), dts[1:]
+
+
+def preintegrate_imu(
+    imu: NDArray[Any], before: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], p_WB_W: Array = ZERO
+) -> gtsam.PreintegratedCombinedMeasurements:
+    """Return GTSAM's preintegration of a block of at least one sample, around the biases of `block`.
+
+    What gaps add to the noise is spread over the block as white noise of the same total. Told how W turns, GTSAM 4.3
+    predicts what `imu.predict` does, but takes W to turn about its origin: the centrifugal force that this adds at
+    p_WB_W, where the block begins, is part of gravity already, and is taken off it here.
+    """
+    g, b = rig[0], block[0]
+    held_s = float(imu["held_s"] @ imu["dt_s"]) / float(b["T"])
+    gyro_var, accel_var = g["gyro_density"] ** 2, g["accel_density"] ** 2
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(g["gravity"])
+    params.setGyroscopeCovariance((gyro_var + HELD_RATE**2 * held_s) * np.eye(3))
+    params.setAccelerometerCovariance((accel_var + HELD_ACCEL**2 * held_s) * np.eye(3))
+    params.setIntegrationCovariance(INTEGRATION_DENSITY**2 * np.eye(3))
+    accel_walk, gyro_walk = (max(g[f"{s}_walk"], LEAST_WALK * g[f"{s}_density"]) for s in ("accel", "gyro"))
+    params.setBiasAccCovariance(accel_walk**2 * np.eye(3))
+    params.setBiasOmegaCovariance(gyro_walk**2 * np.eye(3))
+    if b["w_CW_W"].any():
+        params.setOmegaCoriolis(b["w_CW_W"])
+        params.n_gravity = params.n_gravity + np.cross(b["w_CW_W"], np.cross(b["w_CW_W"], p_WB_W))
+    bias = gtsam.imuBias.ConstantBias(g["R_BI"] @ b["b_a"], g["R_BI"] @ b["b_g"])
+    preintegrated = gtsam.PreintegratedCombinedMeasurements(params, bias)
+    accel, gyro, dts = equivalent_samples(imu, before, rig, block)
+    for f, w, dt in zip(accel, gyro, dts.tolist(), strict=True):
+        preintegrated.integrateMeasurement(f, w, dt)
+    return preintegrated
+
+
+@njit(cache=True)
+def _as_state(pose: Array, v_WB_W: Array, bias: Array, R_BI: Array) -> NDArray[Any]:
+    state = np.zeros(1, STATE)
+    _fill(state, pose, v_WB_W, inverse_transform(R_BI, bias[0:3]), inverse_transform(R_BI, bias[3:6]))
+    return state
+
+
+@njit(cache=True)
+def _fill(state: NDArray[Any], pose: Array, v_WB_W: Array, b_a: Array, b_g: Array) -> None:
+    s = state[0]
+    s.R_WB[:], s.p_WB_W[:] = pose[0:3, 0:3], pose[0:3, 3]
+    s.v_WB_W[:], s.b_a[:], s.b_g[:] = v_WB_W, b_a, b_g
+
+
+@njit(cache=True)
+def _by_gtsam(H: Array, R_WB: Array, R_BI: Array) -> tuple[Array, Array, Array]:
+    """Split a Jacobian (n, 15) by our error state into those by GTSAM's pose, velocity and bias."""
+    n = len(H)
+    H_x, H_b = np.empty((n, 6)), np.empty((n, 6))
+    for i in range(n):
+        H_x[i, 0:3] = H[i, THETA]
+        H_x[i, 3:6] = inverse_transform(R_WB, H[i, POSITION])
+        H_b[i, 0:3] = transform(R_BI, H[i, ACCEL_BIAS])
+        H_b[i, 3:6] = transform(R_BI, H[i, GYRO_BIAS])
+    return H_x, H[:, VELOCITY].copy(), H_b
+
+
+@njit(cache=True)
+def _linearise(
+    reading: NDArray[Any],
+    block: NDArray[Any],
+    carried: bool,
+    pose: Array,
+    v_WB_W: Array,
+    bias: Array,
+    rig: NDArray[Any],
+) -> tuple[Array, Array, Array, Array]:
+    """Residual of a reading, carried over `block` first, and its Jacobians by the pose, velocity and bias of i."""
+    state = _as_state(pose, v_WB_W, bias, rig[0].R_BI)
+    r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
+    if carried:
+        F = np.empty((15, 15))
+        predict(block, state, rig[0].gravity, F, state)
+        n = measure(reading, 0, state, rig, r, H, C)
+        H[:n] = H[:n] @ F
+    else:
+        n = measure(reading, 0, state, rig, r, H, C)
+    H_x, H_v, H_b = _by_gtsam(H[:n], pose[0:3, 0:3], rig[0].R_BI)
+    return r[:n].copy(), H_x, H_v, H_b
+
+
+@njit(cache=True)
+def _carried_covariance(reading: NDArray[Any], block: NDArray[Any], state: NDArray[Any], rig: NDArray[Any]) -> Array:
+    """Covariance of a reading's residual, with the noise of the block that carries the keyframe to it."""
+    F, Q, end = np.empty((15, 15)), np.empty((15, 15)), state.copy()
+    r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
+    predict(block, state, rig[0].gravity, F, end)
+    process_noise(block, state[0].R_WB, Q)
+    n = measure(reading, 0, end, rig, r, H, C)
+    return H[:n] @ Q @ H[:n].T + C[:n, :n]
+
+
+def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.NonlinearFactor:
+    """Return the factor of a reading that was true at keyframe i: GTSAM's own where it has one.
+
+    Args:
+        i: keyframe.
+        reading: one READING row.
+        rig: RIG record.
+    """
+    row, g = reading[0], rig[0]
+    sigma = row["sigma"] * g["inflate"][row["kind"]]
+    if row["kind"] == DEPTH:
+        model = gtsam.noiseModel.Diagonal.Sigmas(np.array([np.inf, np.inf, sigma[0]]))
+        return gtsam.GPSFactorArm(X(i), np.array([0.0, 0.0, row["z"][0]]), g["p_BP_B"], model)
+    if row["kind"] == GPS:
+        return gtsam.GPSFactorArm(X(i), row["z"][:3], g["p_BG_B"], gtsam.noiseModel.Diagonal.Sigmas(sigma))
+    if row["kind"] == ATTITUDE:
+        R_WB = row["z"].reshape(3, 3) @ g["R_BH"].T
+        return gtsam.PoseRotationPrior3D(X(i), gtsam.Rot3(R_WB), gtsam.noiseModel.Diagonal.Sigmas(sigma))
+
+    def only_pose(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        r, H_x, _, _ = _linearise(reading, NO_BLOCK, False, values.atPose3(X(i)).matrix(), ZERO, NO_BIAS, rig)
+        if jacobians is not None:
+            jacobians[0] = H_x
+        return r
+
+    def pose_and_velocity(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        pose, v_WB_W = values.atPose3(X(i)).matrix(), values.atVector(V(i))
+        r, H_x, H_v, _ = _linearise(reading, NO_BLOCK, False, pose, v_WB_W, NO_BIAS, rig)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = H_x, H_v
+        return r
+
+    if row["kind"] == HEADING:
+        return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma[0]), [X(i)], only_pose)
+    measured = np.isfinite(sigma)
+    cov = np.diag(sigma[measured] ** 2) + g["rate_cov"][np.ix_(measured, measured)]
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), V(i)], pose_and_velocity)
+
+
+def carried_factor(
+    i: int, reading: NDArray[Any], block: NDArray[Any], at_i: NDArray[Any], rig: NDArray[Any]
+) -> gtsam.CustomFactor:
+    """Return the factor of a reading that was true after keyframe i: the block carries the keyframe to it.
+
+    Args:
+        i: keyframe.
+        reading: one READING row.
+        block: BLOCK record from the keyframe to the reading.
+        at_i: STATE record at keyframe i, where the covariance is evaluated.
+        rig: RIG record.
+    """
+    model = gtsam.noiseModel.Gaussian.Covariance(_carried_covariance(reading, block, at_i, rig))
+
+    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        pose, v_WB_W = values.atPose3(X(i)).matrix(), values.atVector(V(i))
+        bias = values.atConstantBias(B(i)).vector()
+        r, H_x, H_v, H_b = _linearise(reading, block, True, pose, v_WB_W, bias, rig)
+        if jacobians is not None:
+            jacobians[0], jacobians[1], jacobians[2] = H_x, H_v, H_b
+        return r
+
+    return gtsam.CustomFactor(model, [X(i), V(i), B(i)], error)
+
+
+@njit(cache=True)
+def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple[Array, Array, Array]:
+    H_i, H_j = np.empty((3, 15)), np.empty((3, 15))
+    R_i, R_j = pose_i[0:3, 0:3].copy(), pose_j[0:3, 0:3].copy()
+    r = preintegrated_dvl_residual(R_i, pose_i[0:3, 3].copy(), pose_j[0:3, 3].copy(), dp_ij, H_i, H_j)
+    return r, _by_gtsam(H_i, R_i, np.eye(3))[0], _by_gtsam(H_j, R_j, np.eye(3))[0]
+
+
+def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.CustomFactor:
+    """Return the loose preintegrated-DVL factor (eq. 6) between two keyframes."""
+
+    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
+        r, H_i, H_j = _linearise_displacement(pose_i, pose_j, dp_ij)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = H_i, H_j
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], error)
+
+
+@njit(cache=True)
+def _linearise_tight_displacement(
+    displacement: NDArray[Any], K: Array, pose_i: Array, pose_j: Array, bias: Array, R_BI: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Residual, and its Jacobians by the pose of i, that of j, and the bias of i."""
+    H_i, H_j = np.empty((3, 15)), np.empty((3, 15))
+    R_i, R_j, b_g = pose_i[0:3, 0:3].copy(), pose_j[0:3, 0:3].copy(), inverse_transform(R_BI, bias[3:6])
+    p_i, p_j = pose_i[0:3, 3].copy(), pose_j[0:3, 3].copy()
+    r = tight_dvl_residual(R_i, p_i, b_g, R_j, p_j, displacement, K, H_i, H_j)
+    H_x, _, H_b = _by_gtsam(H_i, R_i, R_BI)
+    return r, H_x, _by_gtsam(H_j, R_j, R_BI)[0], H_b
+
+
+def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
+    """Return the tight preintegrated-DVL factor: the displacement given the rotation and the gyro bias of keyframe i.
+
+    Args:
+        i, j: keyframes.
+        displacement: DISPLACEMENT record from i to j.
+        rig: RIG record.
+    """
+    K, cov = given_rotation(displacement[0]["N"])
+    R_BI = rig[0]["R_BI"]
+
+    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
+        bias = values.atConstantBias(B(i)).vector()
+        r, H_i, H_j, H_b = _linearise_tight_displacement(displacement, K, pose_i, pose_j, bias, R_BI)
+        if jacobians is not None:
+            jacobians[0], jacobians[1], jacobians[2] = H_i, H_j, H_b
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], error)
+
+
+@njit(cache=True)
+def _prior_error(mean: NDArray[Any], state: NDArray[Any], r: Array, H: Array) -> None:
+    """Fill r (15,) = state ⊖ mean, and H (15, 15), its derivative by the state's error."""
+    m, s = mean[0], state[0]
+    r[THETA] = log(product(m.R_WB.T, s.R_WB))
+    r[POSITION], r[VELOCITY] = s.p_WB_W - m.p_WB_W, s.v_WB_W - m.v_WB_W
+    r[ACCEL_BIAS], r[GYRO_BIAS] = s.b_a - m.b_a, s.b_g - m.b_g
+    H[:] = np.eye(15)
+    H[THETA, THETA] = inverse_right_jacobian(r[THETA])
+
+
+@njit(cache=True)
+def _linearise_prior(
+    mean: NDArray[Any], pose: Array, v_WB_W: Array, bias: Array, R_BI: Array
+) -> tuple[Array, Array, Array, Array]:
+    r, H = np.empty(15), np.empty((15, 15))
+    _prior_error(mean, _as_state(pose, v_WB_W, bias, R_BI), r, H)
+    H_x, H_v, H_b = _by_gtsam(H, pose[0:3, 0:3], R_BI)
+    return r, H_x, H_v, H_b
+
+
+def prior_factor(prior: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
+    """Return the prior (a STATE record, its whole P) as one factor on keyframe 0."""
+
+    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        pose, v_WB_W = values.atPose3(X(0)).matrix(), values.atVector(V(0))
+        r, H_x, H_v, H_b = _linearise_prior(prior, pose, v_WB_W, values.atConstantBias(B(0)).vector(), rig[0]["R_BI"])
+        if jacobians is not None:
+            jacobians[0], jacobians[1], jacobians[2] = H_x, H_v, H_b
+        return r
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(prior[0]["P"]), [X(0), V(0), B(0)], error)
+
+
+def insert_state(values: gtsam.Values, i: int, state: NavState, R_BI: Array) -> None:
+    """Add a state to GTSAM's values as keyframe i."""
+    values.insert(X(i), gtsam.Pose3(gtsam.Rot3(state.R_WB), state.p_WB_W))
+    values.insert(V(i), state.v_WB_W)
+    values.insert(B(i), gtsam.imuBias.ConstantBias(R_BI @ state.b_a, R_BI @ state.b_g))
+
+
+def as_state(pose: gtsam.Pose3, v_WB_W: Array, bias: gtsam.imuBias.ConstantBias, R_BI: Array) -> NavState:
+    """Return GTSAM's three variables of a keyframe as a state of ours."""
+    T_WB, b_B = pose.matrix(), bias.vector()
+    return NavState(T_WB[:3, :3], T_WB[:3, 3], v_WB_W, R_BI.T @ b_B[:3], R_BI.T @ b_B[3:])
+
+
+def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array | None = None) -> Array:
+    """Return GTSAM's joint covariance of (pose, velocity, bias) as that of our error state, (15, 15), at R_WB.
+
+    Args:
+        joint: (15, 15) in GTSAM's tangents.
+        R_WB: the estimate's.
+        R_BI: the IMU's mounting.
+        R_WB_linearised: where the factors were linearised, if not at the estimate: iSAM2 leaves that be until a
+            variable has moved by a threshold. In the axes of this one a factor sees a position move, and a metre that
+            nothing has measured, seen in axes a hundredth of a radian off, would outweigh what depth says.
+    """
+    R_at = R_WB if R_WB_linearised is None else R_WB_linearised
+    G = np.zeros((15, 15))
+    G[THETA, THETA], G[VELOCITY, VELOCITY] = right_jacobian(log(product(R_at.T, R_WB))), np.eye(3)
+    G[POSITION, POSITION] = R_at
+    G[ACCEL_BIAS, ACCEL_BIAS] = G[GYRO_BIAS, GYRO_BIAS] = R_BI.T
+    return G @ joint @ G.T
+
+
+@contextmanager
+def gtsam_failures() -> Iterator[None]:
+    """Turn what GTSAM throws into `Diverged`, on one line, its keys by name; after a throw a smoother is dead."""
+    try:
+        yield
+    except Diverged:
+        raise
+    except (RuntimeError, ValueError, IndexError) as error:
+        text = " ".join(str(error).split())
+        named = re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), text)
+        raise Diverged(f"GTSAM: {named[:300]}") from None

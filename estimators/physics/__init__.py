@@ -1,0 +1,1 @@
+"""The physics, once: rotations, the IMU block, measurement residuals and Jacobians, innovations."""

@@ -1,0 +1,88 @@
+"""Innovations: what a reading says against the belief from before it, and whether that belief owned up to it (NIS)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...datasets.epochs import SENSOR
+from ...datasets.state import DIM, Array, Belief
+from .measurements import measure
+from .records import as_record
+
+INNOVATION = np.dtype(
+    [
+        ("kind", "i8"),  # of the reading, as in READING
+        ("t_ns", "i8"),  # when it was true
+        ("dof", "i8"),  # components it measured
+        ("nis", "f8"),  # normalised innovation squared: of an honest belief, chi-square with dof degrees of freedom
+    ]
+)
+
+
+def gate_widths(gate: Mapping[str, float]) -> Array:
+    """Return the largest NIS that passes, (kinds, 4), by kind of reading and its degrees of freedom.
+
+    Args:
+        gate: probability by sensor; what is not named always passes.
+    """
+    from scipy.stats import chi2  # a third of what importing the estimators would take, and only gates need it
+
+    widths = np.full((len(SENSOR), 4), np.inf)
+    for kind, sensor in enumerate(SENSOR):
+        if sensor in gate:
+            widths[kind, 1:] = chi2.ppf(gate[sensor], [1, 2, 3])
+    return widths
+
+
+def innovations(belief: Belief, readings: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
+    """Judge a belief by readings that it has not seen: rᵀ S⁻¹ r of each by itself, with S = H P Hᵀ + C.
+
+    Args:
+        belief: at the readings' time; its velocity has the rate noise of the IMU's lever arm in it (`with_rate_noise`).
+        readings: READING rows, all true at the belief's time.
+        rig: RIG record of length 1 as `compile_rig` returns it, with the inflation that the estimator believes in. Its
+            rate_cov must still be zero: the rate noise is in the belief, and would count twice.
+
+    Returns:
+        INNOVATION rows of the readings that measure anything. nis is NaN where the belief has no covariance, or one
+        under which S is not positive.
+
+    Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2.
+    """
+    table = np.zeros(len(readings), INNOVATION)
+    table["kind"], table["t_ns"] = readings["kind"], readings["t_ns"]
+    judge(readings, as_record(belief), rig, table)
+    return table[table["dof"] > 0]
+
+
+@njit(cache=True)
+def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table: NDArray[Any]) -> None:
+    """Fill dof and nis of a table of INNOVATION rows, one per reading; state and rig are records of length 1."""
+    r, H, C = np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
+    for m in range(len(readings)):
+        n = measure(readings, m, state, rig, r, H, C)
+        if n == 0 or not H[:n].any():  # a yaw looked at from the pole measures nothing
+            continue
+        S = H[:n] @ state[0].P @ H[:n].T + C[:n, :n]
+        table[m].dof, table[m].nis = n, normalised_square(r[:n], S)
+
+
+@njit(cache=True)
+def normalised_square(r: NDArray[Any], S: NDArray[Any]) -> float:
+    """Return rᵀ S⁻¹ r for n components r, by elimination; NaN where S (n, n) is not positive. Both are used up."""
+    total = 0.0
+    for k in range(len(r)):
+        if not S[k, k] > 0.0:
+            return np.nan
+        total += r[k] ** 2 / S[k, k]
+        for i in range(k + 1, len(r)):
+            share = S[i, k] / S[k, k]
+            r[i] -= share * r[k]
+            for j in range(k + 1, len(r)):
+                S[i, j] -= share * S[k, j]
+    return total

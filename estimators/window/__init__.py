@@ -1,0 +1,1 @@
+"""The fixed-lag Gauss-Newton smoother on block-tridiagonal normal equations, compiled."""

@@ -1,0 +1,217 @@
+"""Gauss–Newton's normal equations on a chain of keyframes, in which each is tied to its neighbours only.
+
+They are block-tridiagonal, 15 × 15, and are eliminated from the oldest keyframe to the newest. In the information form
+that is a block Cholesky; but a tactical IMU knows the motion of 0.2 s to 0.1 mm, a prior the place to metres, and the
+eight digits between them (squared: all sixteen) are lost where one is taken from the other. So each step is written in
+the covariance form, in which the strong tie is a small addend and nothing cancels:
+
+    δ_j = F δ_i + c + noise of covariance Q                                   a tie from keyframe i to the next, j
+    N(m, P)              of δ_i, given all that is older and i's own rows
+    N(m_given, P_given)  of δ_j, given the same and the rows of both
+    G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back-substitution
+
+It is the elimination that Rauch, Tung & Striebel (doi:10.2514/3.3166) wrote down first. What a state that has left knew
+is then (m_given, P_given) of the next one: marginalising costs nothing. A row is r + H δ (+ H_j δ_j), of unit variance.
+
+Inner loops run along rows of fixed length, so that they compile to vector instructions.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from ...datasets.state import DIM, Array
+
+NODE = np.dtype(
+    [
+        # what a back-substitution reads lies together
+        ("Gt", "f8", (DIM, DIM)),  # Gᵀ
+        ("m", "f8", (DIM,)),  # what all that is older, and its own rows, say of it
+        ("m_given", "f8", (DIM,)),  # what all that is older says of it
+        ("d", "f8", (DIM,)),  # with all there is: the increment
+        ("t_ns", "i8"),
+        ("next_ns", "i8"),  # of the next keyframe; 0 where there is none
+        ("imu_from", "i8"),  # samples since, and where they end
+        ("imu_to", "i8"),
+        ("first", "i8"),  # of its factors; -1 for none
+        ("dvl", "i8"),  # first of the DVL readings kept for its interval; -1 for none
+        ("moved", "i8"),  # linearised anew in this update
+        ("P", "f8", (DIM, DIM)),  # as m
+        ("P_given", "f8", (DIM, DIM)),  # as m_given
+        ("F", "f8", (DIM, DIM)),  # the tie to the next keyframe
+        ("Q", "f8", (DIM, DIM)),
+        ("c", "f8", (DIM,)),
+    ]
+)
+"""Nodes lie in a ring whose length is a power of two: keyframe k in slot k & (length − 1)."""
+
+
+@njit(cache=True, error_model="numpy")
+def add_scaled(out: Array, a: float, x: Array) -> None:
+    """out += a x, for fifteen components."""
+    for i in range(DIM):
+        out[i] += a * x[i]
+
+
+@njit(cache=True, error_model="numpy")
+def absorb_row(r: float, h: Array, variance: float, m: Array, P: Array) -> bool:
+    """Add the row r + h δ, of some variance, to N(m, P) of δ; False where the innovation's variance is not positive."""
+    PH = np.zeros(DIM)
+    for k in range(DIM):
+        if h[k] != 0.0:
+            add_scaled(PH, h[k], P[k])
+    S, innovation = variance, -r
+    for i in range(DIM):
+        S += h[i] * PH[i]
+        innovation -= h[i] * m[i]
+    if not S > 0.0:
+        return False
+    add_scaled(m, innovation / S, PH)
+    for i in range(DIM):
+        add_scaled(P[i], -PH[i] / S, PH)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def absorb_joint_row(
+    r: float, h_i: Array, h_j: Array, variance: float,
+    m_i: Array, P_i: Array, m_j: Array, P_j: Array, P_ji: Array,
+) -> bool:  # fmt: skip
+    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji being cov(δ_j, δ_i)."""
+    PH_i, PH_j = np.zeros(DIM), np.zeros(DIM)
+    for k in range(DIM):
+        add_scaled(PH_i, h_i[k], P_i[k])
+        add_scaled(PH_i, h_j[k], P_ji[k])
+        add_scaled(PH_j, h_j[k], P_j[k])
+        for i in range(DIM):
+            PH_j[k] += P_ji[k, i] * h_i[i]
+    S, innovation = variance, -r
+    for i in range(DIM):
+        S += h_i[i] * PH_i[i] + h_j[i] * PH_j[i]
+        innovation -= h_i[i] * m_i[i] + h_j[i] * m_j[i]
+    if not S > 0.0:
+        return False
+    add_scaled(m_i, innovation / S, PH_i)
+    add_scaled(m_j, innovation / S, PH_j)
+    for i in range(DIM):
+        add_scaled(P_i[i], -PH_i[i] / S, PH_i)
+        add_scaled(P_j[i], -PH_j[i] / S, PH_j)
+        add_scaled(P_ji[i], -PH_j[i] / S, PH_i)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j: Array, P_ji: Array) -> None:
+    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P and P_j = F P Fᵀ + Q."""
+    P_ij = np.empty((DIM, DIM))
+    P_ji[:] = 0.0
+    for a in range(DIM):
+        m_j[a] = c[a]
+        for k in range(DIM):
+            if F[a, k] != 0.0:
+                m_j[a] += F[a, k] * m[k]
+                add_scaled(P_ji[a], F[a, k], P[k])
+        for k in range(DIM):
+            P_ij[k, a] = P_ji[a, k]
+    for a in range(DIM):
+        P_j[a] = Q[a]
+        for k in range(DIM):
+            if F[a, k] != 0.0:
+                add_scaled(P_j[a], F[a, k], P_ij[k])
+    symmetrise(P_j)
+
+
+@njit(cache=True, error_model="numpy")
+def symmetrise(P: Array) -> None:
+    """Make P (15, 15) symmetric to the last bit."""
+    for i in range(DIM):
+        for j in range(i):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
+
+
+@njit(cache=True, error_model="numpy")
+def divide_into(P: Array, A: Array, X: Array) -> bool:
+    """Fill X = P⁻¹ A, all (15, 15), by elimination of P's correlations; False where P is no covariance.
+
+    What has no variance, or none of its own, is left out of the inverse.
+    """
+    scale, L = np.empty(DIM), np.empty((DIM, DIM))
+    for i in range(DIM):
+        if not P[i, i] >= 0.0:
+            return False
+        scale[i] = 1.0 / math.sqrt(P[i, i]) if P[i, i] > 0.0 else 0.0
+    for i in range(DIM):
+        for j in range(DIM):
+            L[i, j] = P[i, j] * scale[i] * scale[j]
+            X[i, j] = A[i, j] * scale[i]
+    for k in range(DIM):
+        pivot = L[k, k]
+        if not pivot > -1e-9:
+            return False
+        inverse = 1.0 / pivot if pivot > 1e-14 else 0.0
+        for i in range(k + 1, DIM):
+            share = L[i, k] * inverse
+            add_scaled(L[i], -share, L[k])
+            add_scaled(X[i], -share, X[k])
+        for j in range(DIM):
+            X[k, j] *= inverse
+            L[k, j] *= inverse
+    for k in range(DIM - 1, -1, -1):
+        for i in range(k):
+            add_scaled(X[i], -L[i, k], X[k])
+    for i in range(DIM):
+        for j in range(DIM):
+            X[i, j] *= scale[i]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
+    """Fill the increments d of keyframes low to newest."""
+    mask, x = len(nodes) - 1, np.empty(DIM)
+    nodes[newest & mask].d[:] = nodes[newest & mask].m
+    for k in range(newest - 1, low - 1, -1):
+        n, ahead = nodes[k & mask], nodes[(k + 1) & mask]
+        Gt, m, d, d_j, m_j = n.Gt, n.m, n.d, ahead.d, ahead.m_given
+        for j in range(DIM):
+            x[j] = d_j[j] - m_j[j]
+        for i in range(0, DIM, 5):  # five sums at a time stay in registers
+            d_0, d_1, d_2, d_3, d_4 = m[i], m[i + 1], m[i + 2], m[i + 3], m[i + 4]
+            for j in range(DIM):
+                d_0 += Gt[j, i] * x[j]
+                d_1 += Gt[j, i + 1] * x[j]
+                d_2 += Gt[j, i + 2] * x[j]
+                d_3 += Gt[j, i + 3] * x[j]
+                d_4 += Gt[j, i + 4] * x[j]
+            d[i], d[i + 1], d[i + 2], d[i + 3], d[i + 4] = d_0, d_1, d_2, d_3, d_4
+
+
+@njit(cache=True, error_model="numpy")
+def step_back(node: NDArray[Any], ahead: NDArray[Any], P: Array) -> None:
+    """Turn P, the covariance with hindsight of the next keyframe, into that of this one; both NODEs of length 1."""
+    Gt, P_given, own = node[0].Gt, ahead[0].P_given, node[0].P
+    gained = np.zeros((DIM, DIM))
+    for a in range(DIM):
+        for b in range(DIM):
+            add_scaled(gained[a], P[a, b] - P_given[a, b], Gt[b])
+    P[:] = own
+    for i in range(DIM):
+        for a in range(DIM):
+            add_scaled(P[i], Gt[a, i], gained[a])
+    symmetrise(P)
+
+
+@njit(cache=True, error_model="numpy")
+def covariance_with_hindsight(nodes: NDArray[Any], k: int, newest: int) -> Array:
+    """Return the covariance (15, 15) of δ_k, given all there is; it costs a step for every keyframe since k."""
+    mask = len(nodes) - 1
+    P = nodes[newest & mask].P.copy()
+    for i in range(newest - 1, k - 1, -1):
+        a, b = i & mask, (i + 1) & mask
+        step_back(nodes[a : a + 1], nodes[b : b + 1], P)
+    return P

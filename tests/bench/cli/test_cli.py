@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from fathom.bench.cli.app import app
+from fathom.datasets import Trajectory
+from typer.testing import CliRunner
+
+FATHOM = Path(sys.executable).with_name("fathom")
+
+
+def call(*arguments: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def write(folder: Path, **changes: str) -> Path:
+    """Write a short experiment, with some of its lines changed."""
+    lines = {
+        "logs": "[{scenario: {duration_s: 20}}]",
+        "estimators": "[{name: dead-reckoning}, {name: eskf}]",
+    } | changes
+    file = folder / "short.yaml"
+    file.write_text("".join(f"{key}: {value}\n" for key, value in lines.items()))
+    return file
+
+
+def circle(errors_m: float = 0.0) -> Trajectory:
+    angle = np.linspace(0, 6, 200)
+    p = 20 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return Trajectory(np.arange(200) * 10**9, np.repeat(np.eye(3)[None], 200, axis=0), p + np.array([errors_m, 0, 0]))
+
+
+def test_run_writes_store_table_and_figures_and_prints_the_table(tmp_path: Path) -> None:
+    code, out, _ = call("run", write(tmp_path), "--out", tmp_path / "r", "--jobs", 2)
+    assert code == 0
+    assert "eskf" in out
+    assert "alignment: none" in out
+    folder = tmp_path / "r" / "short"
+    assert pd.read_csv(folder / "table.csv")["done"].tolist() == [1, 1]
+    assert r"\toprule" in (folder / "table.tex").read_text()
+    assert pd.read_csv(folder / "consistency.csv")["seeds"].unique().tolist() == [1]
+    assert (folder / "runs.sqlite").is_file()
+    assert len(list((folder / "figures").glob("*.pdf"))) == 5
+
+
+def test_a_failed_run_is_named_on_the_last_line_and_exits_1(tmp_path: Path) -> None:
+    code, out, _ = call("run", write(tmp_path, timeout_s="1.0e-6"), "--out", tmp_path, "--only", "eskf")
+    assert code == 1
+    assert "lawnmower-tactical / eskf seed 1: failed at" in out.splitlines()[-1]
+    assert "out of time" in out.splitlines()[-1]
+
+
+def test_a_recording_that_is_not_here_is_said_plainly(tmp_path: Path) -> None:
+    logs = "[{scenario: {duration_s: 20}}, {log: ictineu_stpere_2004}]"
+    file = write(tmp_path, logs=logs, estimators="[{name: dead-reckoning}]")
+    code, out, _ = call("run", file, "--out", tmp_path, "--data", tmp_path, "--jobs", 1)
+    assert code == 0
+    assert "ictineu_stpere_2004: not here: " in out.splitlines()[-1]
+    assert call("run", file, "--out", tmp_path, "--data", tmp_path, "--only", "ictineu*")[0] == 2
+
+
+def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(tmp_path: Path) -> None:
+    file = write(tmp_path, logs="[{log: ictineu_stpere_2004}]", estimators="[{name: dead-reckoning}]")
+    run = ("run", file, "--out", tmp_path)
+    assert call(*run, "--data", tmp_path)[0] == 2
+    with closing(sqlite3.connect(tmp_path / "short" / "runs.sqlite")) as store, store:
+        store.execute("UPDATE runs SET status = 'done', ate_rmse_m = 1.5, n_scored = 9")
+    code, out, err = call(*run, "--data", tmp_path)
+    assert code == 2
+    assert "1.50" in out
+    assert "its rows are from an earlier run" in err
+
+
+def test_only_after_a_change_leaves_what_is_outdated_out_of_the_csv(tmp_path: Path) -> None:
+    assert call("run", write(tmp_path), "--out", tmp_path, "--jobs", 2)[0] == 0
+    changed = write(tmp_path, scores="{rpe_delta: 5.0}")
+    code, _, err = call("run", changed, "--out", tmp_path, "--jobs", 1, "--only", "dead-reckoning")
+    assert code == 0
+    assert pd.read_csv(tmp_path / "short" / "table.csv")["label"].tolist() == ["dead-reckoning"]
+    assert "1 rows of another spec or version are left out" in err
+
+
+def test_only_leaves_the_others_in_the_csv(tmp_path: Path) -> None:
+    file = write(tmp_path)
+    assert call("run", file, "--out", tmp_path, "--jobs", 2)[0] == 0
+    code, out, _ = call("run", file, "--out", tmp_path, "--jobs", 1, "--only", "eskf")
+    assert code == 0
+    assert "dead-reckoning" not in out
+    assert pd.read_csv(tmp_path / "short" / "table.csv")["label"].tolist() == ["dead-reckoning", "eskf"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "no_such"], "no such experiment"),
+        (["run", "{tmp}/short.yaml", "--only", "zebra"], "matches none"),
+        (["run", "{tmp}/typo.yaml"], "did you mean 'eskf'"),
+        (["run", "{tmp}/nolog.yaml"], "nowhere: no such log"),
+        (["simulate", "yoyo", "-o", "{tmp}/x"], "did you mean 'yo-yo'"),
+        (["simulate", "{tmp}/none.yaml", "-o", "{tmp}/x"], "none.yaml"),
+        (["score", "{tmp}/a.tum", "{tmp}/b.tum"], "a.tum: no such file"),
+        (["score", "{tmp}", "{tmp}/b.tum"], "a folder"),
+        (["score", "/proc/self/mem", "{tmp}/b.tum"], "/proc/self/mem: cannot be read"),
+        (["score", "x" * 300, "{tmp}/b.tum"], "cannot be read"),
+        (["score", "a", "b", "--tolerance-s", "inf"], "--tolerance-s"),
+        (["score", "a", "b", "--delta", "-1"], "delta must be positive"),
+        (["score", "a", "b", "--delta", "nan"], "delta must be positive"),
+        (["score", "a", "b", "--delta", "1.5", "--unit", "frames"], "whole in frames"),
+        (["run", "x" * 300], "no such experiment"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2_before_anything_runs(tmp_path: Path, arguments: list[str], says: str) -> None:
+    write(tmp_path)
+    (tmp_path / "typo.yaml").write_text("logs: [{scenario: {}}]\nestimators: [{name: esfk}]\n")
+    (tmp_path / "nolog.yaml").write_text("logs: [{log: nowhere}]\nestimators: [{name: eskf}]\n")
+    filled = [argument.format(tmp=tmp_path) for argument in arguments]
+    code, out, err = call(*filled, *(["--out", tmp_path / "r"] if arguments[0] == "run" else []))
+    assert code == 2
+    assert out == ""
+    assert says in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "r").exists()
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_table_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("fathom.bench.output.present.write_table", full)
+    code, _, err = call("run", write(tmp_path), "--out", tmp_path, "--jobs", 1, "--only", "dead*")
+    assert code == 2
+    assert "No space left on device" in err
+    assert err.count("\n") == 1
+
+
+def test_list_says_which_estimator_cannot_be_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    wreck = EntryPoint("wreck", "no_such_module_here:Wreck", "fathom.estimators")
+    monkeypatch.setattr("fathom.estimators.registry._plugins", lambda: {"wreck": wreck})
+    code, out, _ = call("list", "estimators")
+    assert code == 0
+    assert "wreck: cannot be loaded" in out
+    assert "eskf: factors" in out
+
+
+def test_list_names_what_there_is() -> None:
+    assert "eskf: factors" in call("list", "estimators")[1]
+    assert "filter_vs_smoother: " in call("list", "experiments")[1]
+    for score in ("ate_rmse_m", "nees_velocity", "within_2sigma_all", "nis_dvl", "step_median_us"):
+        assert f"{score}: " in call("list", "scores")[1]
+    assert "ictineu_stpere_2004" in call("list", "logs")[1]
+    assert call("list", "fish")[0] == 2
+
+
+def test_a_simulated_folder_runs_like_any_log(tmp_path: Path) -> None:
+    (tmp_path / "dive.yaml").write_text("{mission: yo-yo, duration_s: 20}\n")
+    code, out, _ = call("simulate", tmp_path / "dive.yaml", "-o", tmp_path / "dive", "--seed", 5)
+    assert code == 0
+    assert "20 s" in out
+    file = write(tmp_path, logs=f"[{{log: {tmp_path / 'dive'}}}]", estimators="[{name: dead-reckoning}]")
+    code, out, _ = call("run", file, "--out", tmp_path, "--jobs", 1)
+    assert code == 0
+    assert out.startswith("dive")
+
+
+def test_a_simulated_log_without_sensors_is_told_as_it_is(tmp_path: Path) -> None:
+    off = ", ".join(f"{sensor}: null" for sensor in ("dvl", "depth", "gps", "heading"))
+    (tmp_path / "blind.yaml").write_text(f"{{duration_s: 20, {off}}}\n")
+    code, out, _ = call("simulate", tmp_path / "blind.yaml", "-o", tmp_path / "blind")
+    assert code == 0
+    assert out.rstrip().endswith(" 20 s, imu, truth")
+
+
+def test_score_prints_errors_with_their_alignment(tmp_path: Path) -> None:
+    circle().to_tum(tmp_path / "truth.tum")
+    circle(3.0).to_tum(tmp_path / "estimate.tum")
+    code, out, _ = call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--delta", 6)
+    assert code == 0
+    assert "3.000000" in out
+    assert "pairs" in out
+    assert "alignment: none" in out
+    code, out, _ = call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--align", "se3")
+    assert "3.000000" not in out
+    assert "alignment: se3" in out
+    assert "no RPE: rpe: no pair of poses is 1.0 m apart" in out  # they are 0.6 m apart
+    assert call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--unit", "feet")[0] == 2
+
+
+def test_help_imports_nothing_heavy() -> None:
+    heavy = "{'numpy', 'pandas', 'numba', 'gtsam', 'matplotlib', 'scipy', 'pydantic'}"
+    code = f"import sys, fathom.bench.cli.app; sys.exit(', '.join({heavy} & set(sys.modules)) or 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    shown = subprocess.run([FATHOM, "--help"], capture_output=True, text=True, check=False)
+    assert shown.returncode == 0
+    for command in ("run", "list", "simulate", "score"):
+        assert command in shown.stdout
+
+
+def test_ctrl_c_keeps_the_finished_runs_and_exits_130(tmp_path: Path) -> None:
+    labels = ", ".join(f"{{name: dead-reckoning, label: n{k}}}" for k in range(200))
+    file = write(tmp_path, estimators=f"[{labels}]", logs="[{scenario: {duration_s: 300}}]")
+    store = tmp_path / "short" / "runs.sqlite"
+    running = subprocess.Popen(
+        [FATHOM, "run", file, "--out", tmp_path, "--jobs", "2"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while count(store) < 3 and time.monotonic() < deadline and running.poll() is None:
+            time.sleep(0.05)
+        os.killpg(running.pid, signal.SIGINT)  # as the terminal does: parent and workers
+        out, err = running.communicate(timeout=120)
+    finally:
+        running.kill()
+    assert running.returncode == 130, err
+    assert f"kept in {store}" in err
+    assert "Traceback" not in err
+    assert out == ""
+    assert 3 <= count(store) < 200
+    deadline = time.monotonic() + 20
+    while alive(running.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not alive(running.pid)
+
+
+def alive(group: int) -> list[str]:
+    """The processes of a group that are left and no zombies."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            name, fields = stat.read_text().rsplit(")", 1)
+        except OSError:
+            continue
+        state, _, its_group, *_ = fields.split()
+        if int(its_group) == group and state != "Z":
+            found.append(name)
+    return found
+
+
+def count(store: Path) -> int:
+    if not store.is_file():
+        return 0
+    try:
+        with closing(sqlite3.connect(store)) as connection:
+            return int(connection.execute("SELECT count(*) FROM runs").fetchone()[0])
+    except sqlite3.OperationalError:  # its table is not made yet
+        return 0

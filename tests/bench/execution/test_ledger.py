@@ -1,0 +1,278 @@
+"""The ledger: a finished run is never lost, never doubled, never made twice, and a changed one is another run."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fathom.bench.errors import ExperimentError
+from fathom.bench.execution import sweep as runner
+from fathom.bench.execution import worker as working
+from fathom.bench.execution.sweep import run_experiment
+from fathom.bench.experiment.plan import Experiment
+from fathom.bench.output.tables.table import write_table
+from fathom.bench.results import identity as ledger
+from fathom.bench.results.identity import content_sha256, identity
+from fathom.bench.results.store import load_runs, sole_writer
+from fathom.datasets import Scenario, simulate
+from fathom.datasets.described.folder import write_folder
+
+SHORT: dict[str, Any] = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
+
+
+def experiment(**changes: Any) -> Experiment:
+    content = {"name": "t", "logs": [SHORT], "estimators": [{"name": "dead-reckoning"}]} | changes
+    return Experiment.from_dict(content, "t.yaml")
+
+
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What was run, by name; in this process, since what is tried here is which runs are made."""
+    names: list[str] = []
+    bench = working.Bench()
+
+    def here(tasks: Any, jobs: int) -> Any:
+        for task in tasks:
+            names.append(str(task.run))
+            yield bench.execute(task)
+
+    monkeypatch.setattr(runner, "run_all", here)
+    return names
+
+
+def test_what_is_done_is_not_done_again_until_forced(tmp_path: Path, ran: list[str]) -> None:
+    first = run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    assert len(ran) == 2
+    assert (first.attrs["standing"], first.attrs["renewed"]) == (0, 0)
+    again = run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path)
+    assert ran[2:] == ["lawnmower-tactical / dead-reckoning seed 3"]
+    assert (again.attrs["standing"], again.attrs["renewed"]) == (2, 0)
+    assert again["finished"].tolist()[:2] == first["finished"].tolist()
+    run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path, force=True)
+    assert len(ran) == 6
+    assert len(load_runs(tmp_path / "t")) == 3
+
+
+def test_a_changed_option_or_score_makes_a_new_run_and_says_so(tmp_path: Path, ran: list[str]) -> None:
+    run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    changed = [{"name": "dead-reckoning", "with": {"attitude": "gyro"}}]
+    rows = run_experiment(experiment(seeds=[1, 2], estimators=changed), out=tmp_path)
+    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 2)
+    rows = run_experiment(experiment(seeds=[1, 2], estimators=changed, scores={"rpe_delta": 2.0}), out=tmp_path)
+    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 2)
+    assert len(load_runs(tmp_path / "t")) == 2
+    assert len(ran) == 6
+
+
+def test_another_version_or_other_code_makes_new_runs(
+    tmp_path: Path, ran: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_experiment(experiment(), out=tmp_path)
+    there = ledger.versions()
+    for name in ("numpy", "code"):
+        changed = there | {name: "other"}
+        monkeypatch.setattr(ledger, "versions", lambda changed=changed: changed)
+        assert run_experiment(experiment(), out=tmp_path).attrs["renewed"] == 1
+    assert len(ran) == 3
+
+
+def test_a_recorded_log_whose_readings_have_changed_is_another_log(tmp_path: Path, ran: list[str]) -> None:
+    log = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
+    folder = write_folder(log, tmp_path / "a", "csv")
+    plan = experiment(logs=[{"log": str(folder)}])
+    run_experiment(plan, out=tmp_path / "out")
+    assert run_experiment(plan, out=tmp_path / "out").attrs["standing"] == 1
+    lines = (folder / "depth.csv").read_text().splitlines()
+    (folder / "depth.csv").write_text("\n".join(lines[:-1]) + "\n")
+    assert run_experiment(plan, out=tmp_path / "out").attrs["renewed"] == 1
+    assert len(ran) == 2
+
+
+def test_a_run_that_failed_is_tried_again_and_one_that_diverged_is_not(
+    tmp_path: Path, ran: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    with closing(sqlite3.connect(tmp_path / "t" / "runs.sqlite")) as store, store:
+        store.execute("UPDATE runs SET status = 'failed' WHERE seed = 1")
+        store.execute("UPDATE runs SET status = 'diverged' WHERE seed = 2")
+    rows = run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    assert rows["status"].tolist() == ["done", "diverged"]
+    assert len(ran) == 3
+
+
+def test_trajectories_that_no_row_speaks_of_are_swept(tmp_path: Path, ran: list[str]) -> None:
+    run_experiment(experiment(), out=tmp_path)
+    folder = tmp_path / "t" / "trajectories"
+    spoken_of = {path.name for path in folder.iterdir()}
+    assert len(spoken_of) == 2
+    (folder / "half.parquet.123").write_bytes(b"x")
+    changed = [{"name": "dead-reckoning", "with": {"attitude": "gyro"}}]
+    rows = run_experiment(experiment(estimators=changed), out=tmp_path)
+    left = {path.name for path in folder.iterdir()}
+    assert left == {rows.iloc[0]["trajectory"], rows.iloc[0]["truth_trajectory"]}
+    assert rows.iloc[0]["truth_trajectory"] in spoken_of
+
+
+def test_two_writers_at_once_get_a_plain_error(tmp_path: Path) -> None:
+    (tmp_path / "t" / "trajectories").mkdir(parents=True)
+    with sole_writer(tmp_path / "t"), pytest.raises(ExperimentError, match=f"process {os.getpid()}.*is writing here"):
+        run_experiment(experiment(), out=tmp_path)
+    with sole_writer(tmp_path / "t"):  # it is free again
+        pass
+
+
+def test_another_recorded_path_under_the_same_name_is_another_log(tmp_path: Path, ran: list[str]) -> None:
+    scenario: dict[str, Any] = {"mission": "recorded", "path": str(tmp_path / "path.tum"), "duration_s": 20}
+    plan = experiment(logs=[{"scenario": scenario | {"path_spacing_s": 1.0, "path_start_s": 30.0}}])
+    truth = simulate(Scenario(mission="lawnmower", duration_s=80), seed=1).truth
+    assert truth is not None
+    truth.to_tum(tmp_path / "path.tum")
+    first = run_experiment(plan, out=tmp_path / "out")
+    assert first["status"].tolist() == ["done"]
+    assert run_experiment(plan, out=tmp_path / "out").attrs["standing"] == 1
+    replace(truth, p_WB_W=1.1 * truth.p_WB_W).to_tum(tmp_path / "path.tum")
+    again = run_experiment(plan, out=tmp_path / "out")
+    assert again.attrs["renewed"] == 1
+    assert again["identity"].tolist() != first["identity"].tolist()
+
+
+def test_rows_of_an_older_version_are_renewed_and_counted(tmp_path: Path, ran: list[str]) -> None:
+    run_experiment(experiment(), out=tmp_path)
+    with closing(sqlite3.connect(tmp_path / "t" / "runs.sqlite")) as store, store:
+        store.execute("ALTER TABLE runs DROP COLUMN identity")
+    rows = run_experiment(experiment(), out=tmp_path)
+    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 1)
+    assert len(load_runs(tmp_path / "t")) == 1
+
+
+def test_a_full_disk_does_not_keep_the_lock_from_holding(tmp_path: Path) -> None:
+    (tmp_path / "lock").symlink_to("/dev/full")
+    with sole_writer(tmp_path):
+        pass
+
+
+def test_a_folder_that_cannot_be_locked_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with pytest.raises(ExperimentError, match="cannot be locked"), sole_writer(tmp_path):
+        pass
+
+
+def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
+    spec = experiment().spec(experiment().runs()[0])
+    assert identity(spec, None) == identity(json.loads(json.dumps(spec)), None)
+    assert identity(spec, None) != identity(spec | {"seed": 2}, None) != identity(spec, "x")
+    log = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
+    same = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
+    assert content_sha256(log) == content_sha256(same)
+    f_I = log.imu.f_I.copy()
+    f_I[3, 1] = np.nextafter(f_I[3, 1], 1.0)
+    assert content_sha256(replace(log, imu=replace(log.imu, f_I=f_I))) != content_sha256(log)
+    assert content_sha256(replace(log, depth=None)) != content_sha256(log)
+
+
+KILLED = """
+import json, os, random, signal, sqlite3, sys, time
+from contextlib import closing
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from fathom.bench import runner, task, workers, working
+from fathom.bench.experiment.plan import Experiment
+
+plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
+
+
+class Forked:
+    # a worker's process as the child of a warm one, which starts at once
+    stdin = None
+
+    def __init__(self, descriptor):
+        theirs = Connection(os.dup(descriptor))
+        self.process = get_context("fork").Process(target=working.work, args=(theirs,), daemon=True)
+        self.process.start()
+        self.kill, self.wait = self.process.kill, self.process.join
+
+
+workers.start = Forked
+for run in plan.runs()[:2]:
+    working.Bench().execute(task.Task.of(plan, run))
+
+
+def held():
+    if not (out / "t" / "runs.sqlite").is_file():
+        return []
+    with closing(sqlite3.connect(out / "t" / "runs.sqlite")) as store:
+        if not store.execute("SELECT 1 FROM sqlite_master WHERE name = 'runs'").fetchone():
+            return []
+        return store.execute("SELECT label, seed, output, status, finished FROM runs").fetchall()
+
+
+moments, longest_s, begun = random.Random(7), None, time.monotonic()
+for _ in range(kills):
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        runner.run_experiment(plan, out=out, jobs=2)
+        os._exit(0)
+    if longest_s is None:  # how long is a moment on this machine, as busy as it is
+        while len(held()) < 6:
+            time.sleep(0.01)
+        longest_s = time.monotonic() - begun
+    else:
+        time.sleep(moments.uniform(0.0, longest_s))
+    os.killpg(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    print(json.dumps([os.waitstatus_to_exitcode(status), held()]), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_a_hundred_moments_no_run_is_lost_none_doubled_and_the_table_is_the_same(tmp_path: Path) -> None:
+    estimators = [{"name": name, "label": f"{name} {k}"} for k in range(3) for name in ("eskf", "dead-reckoning")]
+    content: dict[str, Any] = {"name": "t", "logs": [SHORT], "estimators": estimators, "seeds": 60}
+    (tmp_path / "killed.py").write_text(KILLED)
+    command = [sys.executable, str(tmp_path / "killed.py"), json.dumps(content), str(tmp_path / "out"), "100"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=900).stdout
+    states = [json.loads(line) for line in printed.splitlines()]
+    assert len(states) == 100
+    before: set[tuple[Any, ...]] = set()
+    for _, rows in states:
+        held = {tuple(row) for row in rows}
+        assert len({row[:3] for row in held}) == len(rows)  # none doubled
+        assert before <= held  # none lost, none made again: `finished` is among what is compared
+        before = held
+    assert sum(code == -signal.SIGKILL for code, _ in states) > 50
+    grown = [len(rows) for _, rows in states]
+    assert len(set(grown)) > 25, f"kills must fall between runs, found {grown}"
+
+    plan = Experiment.from_dict(content, "t.yaml")
+    ended = run_experiment(plan, out=tmp_path / "out", jobs=2)
+    undisturbed = run_experiment(plan, out=tmp_path / "whole", jobs=2)
+    assert len(load_runs(tmp_path / "out" / "t")) == len(ended) == 360
+    for rows, name in ((ended, "a.csv"), (undisturbed, "b.csv")):
+        timed = [c for c in rows if c in {"started", "finished", "peak_mb", *runner_costs()}]
+        write_table(rows.drop(columns=timed).reindex(columns=rows.columns), tmp_path / name)
+    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+    files = {path.name for path in (tmp_path / "out" / "t" / "trajectories").iterdir()}
+    assert files == {*ended["trajectory"], *ended["truth_trajectory"]}
+
+
+def runner_costs() -> list[str]:
+    from fathom.bench.metrics.scoring import COSTS
+
+    return list(COSTS)

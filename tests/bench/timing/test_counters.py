@@ -1,0 +1,35 @@
+"""Work per step is what it was: slots, relinearisations, callbacks, calls and allocations, which no machine changes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from fathom.bench.results.identity import versions
+from fathom.bench.timing.counters import COUNTED, count
+
+BASELINE = Path(__file__).parent / "counters.json"
+DECIDES = ("numpy", "numba", "gtsam")
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_no_step_does_more_or_less_than_the_baseline_says(name: str) -> None:
+    """Where that is meant: `fathom timing --counters -o tests/bench/timing/counters.json`, and the commit says why."""
+    baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
+    here, there = versions(), baseline["versions"]
+    differ = [package for package in DECIDES if here[package] != there[package]]
+    if here["python"].rpartition(".")[0] != there["python"].rpartition(".")[0]:
+        differ.append("python")
+    if differ:
+        pytest.skip(f"the baseline was counted with another {', '.join(differ)}")
+    assert count(name) == pytest.approx(baseline["counters"][name], rel=0.02)
+
+
+def test_a_factor_that_is_called_more_often_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """iSAM2 with its thresholds at zero linearises everything anew in every step."""
+    usual = json.loads(BASELINE.read_text(encoding="utf-8"))["counters"]["fls, lag 3 s"]
+    monkeypatch.setitem(COUNTED, "fls, lag 3 s", ("fls", {"lag_s": 3.0, "relinearize": [0.0] * 4}))
+    zealous = count("fls, lag 3 s")
+    assert zealous["callbacks"] > 2 * usual["callbacks"]
+    assert zealous["relinearised"] > 2 * usual["relinearised"]

@@ -1,0 +1,197 @@
+"""The smoother is least squares where least squares is exact, and beats its own filter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg
+from fathom.bench.execution.drive import run_log
+from fathom.bench.metrics import associate, state_errors
+from fathom.datasets import Belief, Trajectory
+from fathom.datasets.epochs import Epoch, cut
+from fathom.datasets.simulated.scenario import Scenario
+from fathom.datasets.simulated.simulator import simulate
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec
+from fathom.estimators import create
+from fathom.estimators.filters import rts
+from fathom.estimators.filters.eskf_filterpy import stack
+from fathom.estimators.filters.rts import PAGE, STANDSTILL, divide, smooth_one
+from fathom.estimators.interface import FACTORS
+from fathom.estimators.physics.imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise
+from fathom.estimators.physics.records import as_belief, as_record, with_rate_noise
+from paths import random_state
+from test_filters import DELAYED, LINEAR, TOY_RIG, linear_toy
+
+
+def smoothed(prior: Belief, epochs: list[Epoch], rig: object) -> Trajectory:
+    run = create("rts").begin(prior, rig)
+    for epoch in epochs:
+        run.step(epoch)
+    return run.finish()
+
+
+def least_squares(
+    prior: Belief, epochs: list[Epoch], rig: object, rows: np.ndarray, iterations: int
+) -> tuple[list[Belief], np.ndarray]:
+    """MAP states at the prior and after each epoch, by Gauss–Newton on the whole log as one dense problem.
+
+    Of the error state only `rows` are free. Each iteration linearises at the states themselves; motions are integrated
+    at each state's own biases. Returns the beliefs of the epochs and the last step over sigma.
+    """
+    record = compile_rig(rig, FACTORS, {})
+    first = first_sample(epochs[0].imu, record)
+    states = [prior.state]
+    before, block, F, Q = first, np.zeros(1, BLOCK), np.empty((15, 15)), np.empty((15, 15))
+    for epoch in epochs:  # start from the prior, carried on
+        x = as_record(Belief(0, states[-1], np.eye(15)))
+        integrate(epoch.imu, before, x["b_a"][0], x["b_g"][0], record, block)
+        predict(block, x, rig.gravity, F, x)
+        states.append(as_belief(0, x).state)
+        before = epoch.imu[-1:]
+    n, m = len(states), len(rows)
+    for _ in range(iterations):
+        before, grid = first, np.ix_(rows, rows)
+        lines = [whitened(n, {0: np.eye(m)}, prior.state.local(states[0])[rows], prior.P[grid])]
+        for k, epoch in enumerate(epochs):
+            x = as_record(Belief(0, states[k], np.eye(15)))
+            R_i = x["R_WB"][0].copy()
+            integrate(epoch.imu, before, x["b_a"][0], x["b_g"][0], record, block)
+            predict(block, x, rig.gravity, F, x)
+            process_noise(block, R_i, Q)
+            r = as_belief(0, x).state.local(states[k + 1])
+            lines.append(whitened(n, {k: -F[grid], k + 1: np.eye(m)}, r[rows], Q[grid]))
+            z, H, C = stack(as_record(Belief(0, states[k + 1], np.eye(15))), record, epoch.readings)
+            if len(z):
+                lines.append(whitened(n, {k + 1: H[:, rows]}, z, C))
+            before = epoch.imu[-1:]
+        A = np.concatenate(lines)
+        size = np.r_[np.linalg.norm(A[:, :-1], axis=0), 1.0]
+        upper, size = np.linalg.qr(A / size, mode="r"), size[:-1]
+        root = scipy.linalg.solve_triangular(upper[: n * m, : n * m], np.eye(n * m)) / size[:, None]
+        step = root @ upper[: n * m, -1]
+        full = np.zeros((n, 15))
+        full[:, rows] = step.reshape(n, m)
+        states = [x.retract(error) for x, error in zip(states, full, strict=True)]
+    beliefs = []
+    for k, epoch in enumerate(epochs, 1):
+        P, part = np.zeros((15, 15)), root[k * m : (k + 1) * m]
+        P[grid] = part @ part.T
+        beliefs.append(with_rate_noise(Belief(epoch.t_ns, states[k], P), record))
+    return beliefs, step / np.sqrt((root**2).sum(axis=1))
+
+
+def whitened(n: int, parts: dict[int, np.ndarray], r: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """Rows [A | −r] over n states, the parts standing at theirs, whitened by C."""
+    scale, m = 1 / np.sqrt(np.diag(C)), next(iter(parts.values())).shape[1]
+    line = np.zeros((len(r), n * m + 1))
+    for k, A in parts.items():
+        line[:, k * m : (k + 1) * m] = A
+    line[:, -1] = -r
+    return np.linalg.solve(np.linalg.cholesky(C * np.outer(scale, scale)), scale[:, None] * line)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_all_is_linear_it_is_least_squares(seed: int) -> None:
+    prior, epochs = linear_toy(seed)
+    exact, _ = least_squares(prior, epochs, TOY_RIG, LINEAR, 2)
+    ours = smoothed(prior, epochs, TOY_RIG)
+    assert ours.lookahead_s == np.inf
+    for k, belief in enumerate(exact):
+        sigma = np.sqrt(np.diag(belief.P))[LINEAR]
+        grid = np.ix_(LINEAR, LINEAR)
+        assert np.abs(belief.state.local(ours.state(k))[LINEAR] / sigma).max() < 1e-6
+        assert np.abs((ours.P[k] - belief.P)[grid] / np.outer(sigma, sigma)).max() < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise_scale", "iterations", "apart", "P_apart"), [(1.0, 4, 0.3, 0.1), (0.01, 3, 1e-4, 1e-3)])
+def test_on_a_real_mission_only_nonlinearity_parts_it_from_least_squares(
+    noise_scale: float, iterations: int, apart: float, P_apart: float
+) -> None:
+    """All of the state, turning: what parts them, in sigmas, shrinks with the square of the errors.
+
+    With errors a hundredth of what is stated both linearise at the truth; then they must be the same.
+    """
+    readings = {"dvl": DvlSpec(5.0), "depth": DepthSpec(5.0), "gps": GpsSpec(1.0), "heading": HeadingSpec(5.0)}
+    log = simulate(Scenario(duration_s=20.0, surface_for_s=40.0, noise_scale=noise_scale, **readings), seed=3)
+    epochs = cut(log, log.imu.t_ns[19::20]).epochs
+    assert len(epochs) == 100
+    exact, step = least_squares(log.prior, epochs, log.rig, np.arange(15), iterations)
+    assert np.abs(step).max() < 1e-3  # it has converged
+    ours = smoothed(log.prior, epochs, log.rig)
+    for k, belief in enumerate(exact):
+        sigma = np.sqrt(np.diag(belief.P))
+        assert np.abs(belief.state.local(ours.state(k)) / sigma).max() < apart
+        assert np.abs((ours.P[k] - belief.P) / np.outer(sigma, sigma)).max() < P_apart
+
+
+def test_its_last_state_is_the_filters_and_its_times_are_the_ticks() -> None:
+    log = simulate(Scenario(duration_s=120.0), seed=1)
+    result = run_log(log, create("rts"))
+    assert sum(len(epoch.imu) > 0 for epoch in cut(log, result.online.t_ns).epochs) > PAGE  # more than one page
+    assert np.array_equal(result.smoothed.t_ns, result.online.t_ns)
+    last, filtered = result.smoothed.state(-1), result.online.state(-1)
+    assert np.abs(filtered.local(last)).max() < 1e-12
+    assert np.allclose(result.smoothed.P[-1], result.online.P[-1], rtol=1e-9, atol=1e-18)
+    assert np.linalg.eigvalsh(result.online.P - result.smoothed.P).min() > -1e-6  # hindsight never knows less
+
+
+def test_late_readings_leave_no_trace_in_hindsight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Epochs that were lived again replace those that they were lived for, across pages."""
+    monkeypatch.setattr(rts, "PAGE", 7)
+    logs = simulate(Scenario(duration_s=30.0), seed=5), simulate(Scenario(duration_s=30.0, **DELAYED), seed=5)
+    last_ns = int(logs[1].imu.t_ns[-1] - 1e9)
+    tracks = []
+    for log in logs:
+        streams = {}
+        for key, s in log.streams.items():
+            rows = s.t_ns <= last_ns
+            streams[key] = type(s)(s.t_ns[rows], s.received_ns[rows], s.z[rows], s.sigma[rows])
+        tracks.append(run_log(replace(log, **streams), create("rts")).smoothed)
+    a, b = tracks
+    assert np.array_equal(a.t_ns, b.t_ns)
+    for k in range(len(a)):
+        sigma = np.sqrt(np.diag(a.P[k]))
+        assert np.abs(a.state(k).local(b.state(k)) / sigma).max() < 1e-3
+        assert np.abs((a.P[k] - b.P[k]) / np.outer(sigma, sigma)).max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mission", ["lawnmower", "yo-yo"])
+def test_hindsight_beats_the_filter(mission: str) -> None:
+    squares = {"online": np.zeros(2), "smoothed": np.zeros(2)}
+    for seed in range(20):
+        log = simulate(Scenario(mission=mission, duration_s=120.0), seed)
+        result = run_log(log, create("rts"))
+        for output, total in squares.items():
+            truth, track = associate(log.truth, getattr(result, output))
+            e = state_errors(truth, track)
+            total += [((track.p_WB_W - truth.p_WB_W) ** 2).sum(axis=1).mean(), e.velocity_m_s**2]
+    position, velocity = np.sqrt(squares["smoothed"] / squares["online"])
+    assert position < 0.95
+    assert velocity < 0.7
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_over_no_time_hindsight_is_handed_on_as_it_is(seed: int) -> None:
+    """No motion and no noise: whatever is known later is known now, a radian away and to the last digit of P."""
+    rng = np.random.default_rng(seed)
+    x, M = random_state(rng), rng.normal(size=(2, 15, 15))
+    now = as_record(Belief(0, x, M[0] @ M[0].T))
+    later = as_record(Belief(0, x.retract(0.6 * rng.normal(size=15)), 0.1 * M[1] @ M[1].T))
+    assert smooth_one(now, later, STANDSTILL, 9.81, np.zeros(1, STATE))
+    assert np.abs(as_belief(0, now).state.local(as_belief(0, later).state)).max() < 1e-8
+    assert np.allclose(now["P"], later["P"], rtol=1e-6, atol=1e-6)
+
+
+def test_what_has_no_variance_is_left_out_of_the_gain() -> None:
+    rng = np.random.default_rng(0)
+    M, A = rng.normal(size=(5, 5)) * np.array([1, 1e-3, 1e3, 1, 1])[:, None], rng.normal(size=(6, 6))
+    P, G = np.zeros((6, 6)), np.empty((6, 6))
+    P[:5, :5] = M @ M.T
+    assert divide(P, A, G)
+    assert np.allclose(G[:, :5] @ P[:5, :5], A[:5].T, rtol=1e-8, atol=1e-8)
+    assert (G[:, 5] == 0).all()
+    assert not divide(P - 1e-3 * np.eye(6), A, G)
