@@ -22,25 +22,15 @@ from pydantic.dataclasses import dataclass
 
 from ...datasets.epochs import DVL, IMU_SAMPLE, SENSOR, Epoch
 from ...datasets.rig import Rig
-from ...datasets.state import Array, Belief, NavState
+from ...datasets.state import DIM, Array, Belief, NavState
 from ...datasets.trajectory import Trajectory
-from ..filters.eskf import correct, propagate
 from ..interface import FACTORS, Diverged, Factors, Inflation, Pass
 from ..physics.dvl_preintegration import preintegrate_dvl
-from ..physics.imu import (
-    BLOCK,
-    STATE,
-    compile_rig,
-    first_sample,
-    integrate,
-    over_world,
-    predict,
-    process_noise,
-    sandwich,
-)
-from ..physics.innovation import normalised_square
+from ..physics.elimination import normalised_square
+from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict, split
+from ..physics.kalman import carry, correct, propagate
 from ..physics.measurements import measure
-from ..physics.records import as_belief, as_record, split, with_rate_noise
+from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import Loss, Losses, distance, m_estimator, rows, width, with_loss
 from .gtsam_border import (
     carried_factor,
@@ -303,7 +293,7 @@ class GraphPass:
         i, j = last.index, new.index
 
         record, block = self._block(last, self._state, t_ns)
-        state, _, _ = self._predict(record, block, t_ns)
+        state = self._predict(record, block, t_ns)
         preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig, record[0]["p_WB_W"])
         self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
         pending, self._pending = self._pending, []
@@ -425,19 +415,20 @@ class GraphPass:
         integrate(head, keyframe.before, state.b_a, state.b_g, self._rig, block)
         return record, block
 
-    def _predict(self, record: NDArray[Any], block: NDArray[Any], t_ns: int) -> tuple[NavState, Array, Array]:
-        """Return the state at the block's end, t_ns, with the transition and the process noise (15, 15)."""
-        end, F, Q = np.zeros(1, STATE), np.empty((15, 15)), np.empty((15, 15))
+    def _predict(self, record: NDArray[Any], block: NDArray[Any], t_ns: int) -> NavState:
+        """Return the state at the block's end, t_ns."""
+        end, F = np.zeros(1, STATE), np.empty((DIM, DIM))
         predict(block, record, self._rig[0]["gravity"], F, end)
-        process_noise(block, record[0]["R_WB"], Q)
-        return as_belief(t_ns, end).state, F, Q
+        return as_belief(t_ns, end).state
 
     def _carry(self, keyframe: Keyframe, belief: Belief, t_ns: int) -> Belief:
         """Return a belief at a keyframe, carried to t_ns."""
         if t_ns == keyframe.t_ns:
             return belief
-        state, F, Q = self._predict(*self._block(keyframe, belief.state, t_ns), t_ns)
-        return Belief(t_ns, state, sandwich(F, belief.P) + Q)
+        record, block = self._block(keyframe, belief.state, t_ns)
+        record["P"] = belief.P
+        carry(block, record, self._rig[0]["gravity"])
+        return as_belief(t_ns, record)
 
     def _filter_on(self, keyframe: Keyframe, belief: Belief) -> Belief:
         """Return the belief at the newest keyframe, carried to now and corrected by the readings since."""
@@ -462,7 +453,7 @@ class GraphPass:
         r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
         if loss is None or not (n := measure(reading, 0, state, self._rig, r, H, C)):
             return reading
-        weight = m_estimator(loss, n).weight(np.sqrt(normalised_square(r[:n], C[:n, :n])))
+        weight = m_estimator(loss, n).weight(np.sqrt(normalised_square(n, r, H, C)))
         reading = reading.copy()
         reading["sigma"] = reading["sigma"] / np.sqrt(weight) if weight > 0 else np.inf
         return reading

@@ -20,8 +20,8 @@ from ...datasets.trajectory import Trajectory
 from ..graph.graph_pass import LONGEST_SILENCE_S, GraphSmoother
 from ..interface import Diverged
 from ..physics.dvl_preintegration import DISPLACEMENT
-from ..physics.imu import BLOCK, STATE, compile_rig, first_sample
-from ..physics.records import as_belief, as_record, with_rate_noise
+from ..physics.imu import BLOCK, compile_rig, first_sample
+from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import width
 from .chain import NODE
 from .factors import FACTOR, LOSSES

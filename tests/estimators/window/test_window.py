@@ -19,8 +19,8 @@ from fathom.datasets.state import DIM
 from fathom.estimators import FACTORS, Diverged, create
 from fathom.estimators.graph import solvers
 from fathom.estimators.physics.dvl_preintegration import DISPLACEMENT, given_rotation, preintegrate_dvl
-from fathom.estimators.physics.imu import BLOCK, STATE, compile_rig, integrate, predict, process_noise
-from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.physics.imu import BLOCK, compile_rig, integrate, predict, process_noise
+from fathom.estimators.physics.state import STATE, as_belief, as_record
 from fathom.estimators.robust import m_estimator, width
 from fathom.estimators.window.chain import (
     NODE,
