@@ -36,7 +36,7 @@ PROBES: dict[str, tuple[str, ...]] = {
         "imu.predict",
         "imu.process_noise",
         "dvl_preintegration.preintegrate_dvl",
-        "eskf.propagate",
+        "kalman.propagate",
         "iekf.propagate_invariant",
         "eskf_filterpy.FilterpyKalman.predict",
         "ukf.UnscentedKalman.predict",
@@ -46,7 +46,7 @@ PROBES: dict[str, tuple[str, ...]] = {
     ),
     "LINEARISATION": (
         "measurements.measure",
-        "measurements.decorrelate",
+        "elimination.decorrelate",
         "innovation.judge",
         "eskf_filterpy.stack",
         "ukf.measure_points",
@@ -62,7 +62,7 @@ PROBES: dict[str, tuple[str, ...]] = {
     ),
     "SOLVE": (
         "dead_reckoning.DeadReckoningPass._take",
-        "eskf.correct",
+        "kalman.correct",
         "iekf.correct_invariant",
         "eskf_filterpy.FilterpyKalman.correct",
         "ukf.UnscentedKalman.correct",

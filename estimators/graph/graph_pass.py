@@ -17,26 +17,16 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import DVL, IMU_SAMPLE, SENSOR, Epoch
 from ...datasets.rig import Rig
-from ...datasets.state import Array, Belief, NavState
+from ...datasets.state import DIM, Array, Belief, NavState
 from ...datasets.trajectory import Trajectory
-from ..filters.eskf import correct, propagate
 from ..interface import Diverged
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, SOLVE, SUMMED, Keyframes
 from ..physics.dvl_preintegration import preintegrate_dvl
-from ..physics.imu import (
-    BLOCK,
-    STATE,
-    compile_rig,
-    first_sample,
-    integrate,
-    over_world,
-    predict,
-    process_noise,
-    sandwich,
-)
-from ..physics.innovation import normalised_square
+from ..physics.elimination import normalised_square
+from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict, split
+from ..physics.kalman import carry, correct, propagate
 from ..physics.measurements import measure
-from ..physics.records import as_belief, as_record, split, with_rate_noise
+from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import Loss, width
 from ..smoothers import GraphSmoother
 from ..stages import clock, stage
@@ -180,7 +170,7 @@ class GraphPass:
         preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig, record[0]["p_WB_W"])
         self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
         self._window.append(Keyframe(j, t_ns, last.imu[-1:], rest))
-        self._predicted = self._predict(record, block, t_ns)[0]
+        self._predicted = self._predict(record, block, t_ns)
 
     def _solve(self, oldest: int) -> None:
         """Let what leaves the window be written down, then update, and read off the newest state.
@@ -258,20 +248,23 @@ class GraphPass:
         return record, block
 
     @stage("propagation")
-    def _predict(self, record: NDArray[Any], block: NDArray[Any], t_ns: int) -> tuple[NavState, Array, Array]:
-        """Return the state at the block's end, t_ns, with the transition and the process noise (15, 15)."""
-        end, F, Q = np.zeros(1, STATE), np.empty((15, 15)), np.empty((15, 15))
+    def _predict(self, record: NDArray[Any], block: NDArray[Any], t_ns: int) -> NavState:
+        """Return the state at the block's end, t_ns."""
+        end, F = np.zeros(1, STATE), np.empty((DIM, DIM))
         predict(block, record, self._rig[0]["gravity"], F, end)
-        process_noise(block, record[0]["R_WB"], Q)
-        return as_belief(t_ns, end).state, F, Q
+        return as_belief(t_ns, end).state
 
+    @stage("propagation")
     def _carry(self, keyframe: Keyframe, belief: Belief, t_ns: int) -> Belief:
         """Return a belief at a keyframe, carried to t_ns."""
         if t_ns == keyframe.t_ns:
             return belief
-        state, F, Q = self._predict(*self._block(keyframe, belief.state, t_ns), t_ns)
-        return Belief(t_ns, state, sandwich(F, belief.P) + Q)
+        record, block = self._block(keyframe, belief.state, t_ns)
+        record["P"] = belief.P
+        carry(block, record, self._rig[0]["gravity"])
+        return as_belief(t_ns, record)
 
+    @stage("propagation")
     def _filter_on(self, keyframe: Keyframe, belief: Belief) -> Belief:
         """Return the belief at the newest keyframe, carried to now and corrected by the readings since."""
         waiting = self._keyframes.not_given_out()
@@ -296,7 +289,7 @@ class GraphPass:
         r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
         if loss is None or not (n := measure(reading, 0, state, self._rig, r, H, C)):
             return reading
-        weight = m_estimator(loss, n).weight(np.sqrt(normalised_square(r[:n], C[:n, :n])))
+        weight = m_estimator(loss, n).weight(np.sqrt(normalised_square(n, r, H, C)))
         reading = reading.copy()
         reading["sigma"] = reading["sigma"] / np.sqrt(weight) if weight > 0 else np.inf
         return reading

@@ -22,9 +22,10 @@ from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged
 from ..physics.dvl_preintegration import given_rotation
-from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, STATE, predict, process_noise, unbiased
+from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import cross, exp, inverse_right_jacobian, inverse_transform, log, product, right_jacobian, transform
+from ..physics.state import STATE, local
 from ..stages import stage
 
 NO_BLOCK = np.zeros(1, BLOCK)
@@ -54,23 +55,28 @@ def equivalent_samples(
     """
     g, b, n = rig[0], block[0], len(imu)
     rates, forces, dts = unbiased(imu, before, b.b_a, b.b_g, g.R_BI)
-    accel, gyro = np.empty((n, 3)), np.empty((n, 3))
-    R, theta, v, p = np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    accel, gyro, vectors = np.empty((n, 3)), np.empty((n, 3)), np.zeros((6, 3))
+    phi, push, drift, theta, v, p = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
+    R = np.eye(3)
     R_last = R
     for k in range(n):
-        dt, w0, f0, w, f = dts[k + 1], rates[k], forces[k], rates[k + 1], forces[k + 1]
-        slope = dt**3 / (6.0 * (dts[k] + dt))
-        turn = exp(dt * w + slope * cross(w0, w))
-        w_x_f = cross(w, f)
-        push = dt * f + 0.5 * dt**2 * w_x_f + dt**3 / 6.0 * cross(w, w_x_f) + slope * (cross(w0, f) + cross(f0, w))
-        push += cross(w0, g.p_BI_B) - transform(turn, cross(w, g.p_BI_B))
+        dt = dts[k + 1]
+        increments(rates, forces, dts, k, phi, push, drift)
+        turn = exp(phi)
+        before_arm, after_arm = cross(rates[k], g.p_BI_B), transform(turn, cross(rates[k + 1], g.p_BI_B))
+        for i in range(3):
+            push[i] += before_arm[i] - after_arm[i]
         dv = transform(R, push)
-        p += dt * v + 0.5 * dt * dv
-        v += dv
         R_last, R = R, product(R, turn)
-        gyro[k] = transform(right_jacobian(theta), log(R) - theta) / dt
-        accel[k] = push / dt
-        theta = log(R)
+        reached = log(R)
+        missing = np.empty(3)
+        for i in range(3):
+            p[i] += dt * v[i] + 0.5 * dt * dv[i]
+            v[i] += dv[i]
+            missing[i] = reached[i] - theta[i]
+        step = transform(right_jacobian(theta), missing)
+        for i in range(3):
+            gyro[k, i], accel[k, i], theta[i] = step[i] / dt, push[i] / dt, reached[i]
     if n > 1:
         lacking = (b.dp - p) / (b.T - 0.5 * (dts[1] + dts[n]))
         accel[0] += lacking / dts[1]
@@ -309,10 +315,7 @@ def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: N
 @njit(cache=True)
 def _prior_error(mean: NDArray[Any], state: NDArray[Any], r: Array, H: Array) -> None:
     """Fill r (15,) = state ⊖ mean, and H (15, 15), its derivative by the state's error."""
-    m, s = mean[0], state[0]
-    r[THETA] = log(product(m.R_WB.T, s.R_WB))
-    r[POSITION], r[VELOCITY] = s.p_WB_W - m.p_WB_W, s.v_WB_W - m.v_WB_W
-    r[ACCEL_BIAS], r[GYRO_BIAS] = s.b_a - m.b_a, s.b_g - m.b_g
+    local(mean, state, r)
     H[:] = np.eye(15)
     H[THETA, THETA] = inverse_right_jacobian(r[THETA])
 

@@ -20,8 +20,8 @@ from ...datasets.trajectory import Trajectory
 from ..interface import Diverged
 from ..keyframes import LONGEST_SILENCE_S
 from ..physics.dvl_preintegration import DISPLACEMENT
-from ..physics.imu import BLOCK, STATE, compile_rig, first_sample
-from ..physics.records import as_belief, as_record, with_rate_noise
+from ..physics.imu import BLOCK, compile_rig, first_sample
+from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import width
 from ..smoothers import GraphSmoother
 from .chain import NODE
