@@ -17,7 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAda
 from pydantic.dataclasses import dataclass
 
 from ...datasets.described.opening import CATALOG
-from ...datasets.errors import nearest
+from ...datasets.errors import complaints, nearest
 from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import FACTORS, Estimator, sensors_among
@@ -93,7 +93,8 @@ class LogSpec:
         if self.log is not None:
             return Path(self.log).name or Path(self.log).resolve().name
         scenario = Scenario.from_dict(self.scenario or {})
-        return f"{scenario.mission}-{scenario.imu}" if isinstance(scenario.imu, str) else scenario.mission
+        noise = scenario.imu.noise
+        return f"{scenario.mission}-{noise}" if isinstance(noise, str) else scenario.mission
 
     @cached_property
     def source(self) -> Any:
@@ -333,9 +334,7 @@ class Experiment:
         try:
             return TypeAdapter(cls).validate_python(content)
         except ValidationError as error:
-            # where no item of a list is right, pydantic adds that the list is empty
-            errors = [e for e in error.errors() if not (e["type"] == "too_short" and e["input"])]
-            raise ExperimentError(f"{source}: {'; '.join(map(_explain, errors))}") from None
+            raise ExperimentError(f"{source}: {'; '.join(complaints(error, cls))}") from None
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Experiment:
@@ -438,25 +437,3 @@ def _refuse_twice(what: str, values: Iterable[Any]) -> None:
     if twice:
         hint = {"label": "; give each its own `label`", "log name": "; give each its own `name`"}.get(what, "")
         raise ValueError(f"the {what} {twice[0]!r} is there twice{hint}")
-
-
-def _explain(error: Any) -> str:
-    """Put one of pydantic's errors into our words."""
-    *parents, key = error["loc"] or ("",)
-    place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
-    if error["type"] == "unexpected_keyword_argument":
-        known = _known_keys(parents)
-        return f"{place}: unknown key {key!r}{nearest(str(key), known)} (known: {', '.join(known)})"
-    if error["type"] == "missing":
-        return f"{place}: this key is missing"
-    message = error["msg"].removeprefix("Value error, ")
-    found = "" if error["type"] == "value_error" else f", found {error['input']!r:.60}"
-    return f"{place}: {message}{found}" if place else message
-
-
-def _known_keys(parents: list[Any]) -> list[str]:
-    """Return the keys allowed under this place of the file."""
-    kind = {"logs": LogSpec, "estimators": EstimatorSpec, "scores": Scoring, "tune": Sides}.get(
-        parents[0] if parents else "", Experiment
-    )
-    return ["with" if field.name == "options" else field.name for field in dataclasses.fields(kind)]
