@@ -120,7 +120,7 @@ def test_changing_a_nested_value_leaves_the_original_alone() -> None:
 
 def test_variants_survive_being_written_out_again() -> None:
     plan = experiment(estimators=[{"name": "eskf", "drop": ["gps"], "grid": {"max_delay_s": [0, 1]}}])
-    again = Experiment("t", plan.logs, plan.estimators)
+    again = Experiment(name="t", logs=plan.logs, estimators=plan.estimators)
     assert again.estimators == plan.estimators
     assert again.comparisons() == plan.comparisons()
 

@@ -120,7 +120,7 @@ def test_a_number_of_seeds_counts_from_one() -> None:
 
 @pytest.mark.parametrize("seeds", [0, -1, 10**6, "three", True, 2.0])
 def test_seeds_that_are_neither_a_list_nor_a_number_of_them_are_refused(seeds: object) -> None:
-    with pytest.raises(ExperimentError, match="seeds: expected a list of seeds, or how many"):
+    with pytest.raises(ExperimentError, match="`seeds`: expected a list of seeds, or how many"):
         experiment(seeds=seeds)
 
 
