@@ -306,9 +306,9 @@ def test_what_is_in_the_way_of_results_is_named_before_anything_runs(tmp_path: P
 def test_a_worker_is_out_of_reach_of_ctrl_c_from_its_first_moment() -> None:
     worker = Worker()
     try:
-        assert os.getpgid(worker.process.pid) == worker.process.pid != os.getpgid(0)
+        assert os.getpgid(worker.child.process.pid) == worker.child.process.pid != os.getpgid(0)
     finally:
-        worker.kill()
+        worker.child.kill()
 
 
 ORPHANED = """
@@ -322,7 +322,7 @@ estimator = {"name": "mishap", "with": {"kind": "hangs"}}
 plan = Experiment.from_dict({"name": "t", "logs": [log], "estimators": [estimator]})
 worker = Worker()
 worker.begin(Task.of(plan, plan.runs()[0]))
-print(worker.process.pid, flush=True)
+print(worker.child.process.pid, flush=True)
 time.sleep(3600)
 """
 
