@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from fathom.bench.execution.drive import run_log
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment, LogSpec
 from fathom.bench.output.tables.table import write_table
 from fathom.bench.results.store import COLUMNS, Store
@@ -51,7 +51,7 @@ def test_a_run_is_stored_with_its_start(tmp_path: Path, monkeypatch: pytest.Monk
     plan = Experiment.from_dict(PLAN)
     with Store(tmp_path / "runs.sqlite") as store:
         for run in plan.runs():
-            store.write(Bench().execute(Task.of(plan, run)).keep(tmp_path))
+            store.write(WorkerCache().execute(Task.of(plan, run)).keep(tmp_path))
         rows = store.read()
     start = "given" if prior == "given" else "moving, heading unknown"
     assert rows["status"].tolist() == ["done"]
