@@ -90,19 +90,19 @@ def run(
     What an earlier `fathom run` finished is not run again, unless its spec, its log, or the version has changed.
     """
     with refusing_bad_input():
-        from ..execution.sweep import run_experiment
+        from ..execution.sweep import sweep
         from ..experiment.plan import Experiment
         from ..output.present import present
 
         plan = Experiment.load(experiment)
         folder = out / plan.name
         try:
-            rows = run_experiment(plan, data, out, jobs, only, repair, force, dask)
+            outcome = sweep(plan, data, out, jobs, only, repair, force, dask)
         except KeyboardInterrupt:
             _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}; the same command does the rest")
             raise typer.Exit(INTERRUPTED) from None
-        present(rows, plan, folder)
-    statuses = set(rows.loc[~rows["log"].isin(rows.attrs["kept"]), "status"])
+        present(outcome, plan, folder)
+    statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)
     if statuses - {"done", "absent"}:
