@@ -153,7 +153,7 @@ def test_a_store_of_another_version_is_refused_before_anything_runs(tmp_path: Pa
     run_experiment(experiment(), out=tmp_path)
     with closing(sqlite3.connect(tmp_path / "t" / "runs.sqlite")) as store, store:
         store.execute("ALTER TABLE runs DROP COLUMN identity")
-    with pytest.raises(ExperimentError, match="another version wrote it: it lacks column identity; .* move it away"):
+    with pytest.raises(ExperimentError, match=r"another version wrote it: it lacks column identity; .* move it away"):
         run_experiment(experiment(), out=tmp_path)
     assert len(ran) == 1
 

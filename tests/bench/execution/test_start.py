@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -69,14 +67,11 @@ def test_seeds_that_start_otherwise_are_all_named() -> None:
     assert summary["start"] == "static | moving"
 
 
-def test_a_store_from_before_has_no_start(tmp_path: Path) -> None:
-    older = {name: kind for name, kind in COLUMNS.items() if name != "start"}
-    with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as connection, connection:
-        connection.execute(f"CREATE TABLE runs ({', '.join(f'{name} {kind}' for name, kind in older.items())})")
-        connection.execute(
-            "INSERT INTO runs (experiment, log, label, output, status) VALUES ('e', 'l', 'a', 'o', 'done')"
-        )
+def test_a_run_that_never_began_has_no_start(tmp_path: Path) -> None:
     with Store(tmp_path / "runs.sqlite") as store:
+        store.write(
+            [{"experiment": "e", "log": "l", "label": "a", "seed": None, "output": "online", "status": "failed"}]
+        )
         rows = store.read()
         assert rows["start"].isna().tolist() == [True]
         assert summarise(rows)[0]["start"] is None
