@@ -331,7 +331,7 @@ def test_all_estimators_are_one_on_a_turning_earth(spun: Log, name: str, options
 
 @pytest.mark.parametrize("options", [{}, {"keyframe_period_s": 2.0}], ids=str)
 def test_with_hindsight_too(spun: Log, options: dict[str, float]) -> None:
-    assert apart(spun, "batch", "rts", "hindsight", **options) < 0.1
+    assert apart(spun, "batch", "rts", "smoothed", **options) < 0.1
 
 
 @pytest.mark.parametrize("name", ["fls", "window"])
@@ -379,7 +379,7 @@ def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     ("name", "output"),
     [
         ("eskf", "online"),
-        ("rts", "hindsight"),
+        ("rts", "smoothed"),
         pytest.param("iekf", "online", marks=pytest.mark.slow),
         pytest.param("ukf", "online", marks=pytest.mark.slow),
         pytest.param("fls", "online", marks=pytest.mark.slow),
