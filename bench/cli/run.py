@@ -36,16 +36,16 @@ def run(
     Every estimator of EXPERIMENT runs on each of its logs. Finished runs are kept. They are repeated only if their
     spec, their log or a version has changed.
     """
-    from ..execution.sweep import run_experiment
+    from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
     from ..output.present import present
 
     plan = Experiment.load(experiment)
     folder = out / plan.name
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
-        rows = run_experiment(plan, data, out, jobs, only, repair, force, dask)
-    present(rows, plan, folder)
-    statuses = set(rows.loc[~rows["log"].isin(rows.attrs["kept"]), "status"])
+        outcome = sweep(plan, data, out, jobs, only, repair, force, dask)
+    present(outcome, plan, folder)
+    statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)
     if statuses - {"done", "absent"}:

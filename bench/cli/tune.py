@@ -16,7 +16,7 @@ class Output(StrEnum):
     """Which trajectory of an estimator is scored."""
 
     online = "online"
-    hindsight = "hindsight"
+    smoothed = "smoothed"
 
 
 def tune(
@@ -44,7 +44,7 @@ def tune(
         typer.Option(help="Score from `fathom list scores`: errors are minimised, NEES and NIS brought to their due."),
     ] = "ate_rmse_m",
     output: Annotated[
-        Output, typer.Option(help="Trajectory to score: online (no look-ahead), or smoothed (hindsight).")
+        Output, typer.Option(help="Score the online or the smoothed trajectory.")
     ] = Output.online,
     span: Annotated[float, typer.Option(min=1.01, help="Factors are searched from 1/SPAN to SPAN.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,

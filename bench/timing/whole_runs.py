@@ -16,7 +16,7 @@ from ...estimators import create
 from ..execution.child import THREAD_COUNTS, start
 from ..execution.drive import run_log
 from ..execution.task import Task
-from ..execution.worker import Bench
+from ..execution.worker import WorkerCache
 from ..experiment.plan import Experiment
 from ..results.store import Store
 from .budgets import Measured
@@ -49,7 +49,7 @@ def serve(connection: Any, duration: str) -> None:
     duration_s = float(duration)
     experiment = Experiment.from_dict(_experiment(duration_s, 1000))
     tasks = iter([Task.of(experiment, run) for run in experiment.runs()])
-    scenario, estimator, bench = Scenario(duration_s=duration_s), create("eskf"), Bench()
+    scenario, estimator, bench = Scenario(duration_s=duration_s), create("eskf"), WorkerCache()
 
     def whole(task: Task) -> None:
         (row,) = bench.execute(task).rows
@@ -99,7 +99,7 @@ def _again(n: int) -> tuple[float, float, float]:
     with TemporaryDirectory() as temporary:
         file, folder = Path(temporary) / "runs.yaml", Path(temporary) / "runs"
         file.write_text(repr(plan), encoding="utf-8")
-        one = Bench().execute(tasks[0])
+        one = WorkerCache().execute(tasks[0])
         (row,) = one.keep(folder)
         with Store(folder / "runs.sqlite") as store:
             store.write(

@@ -23,8 +23,8 @@ STEEPEST_DEG = 80.0
 """Beyond this pitch the Euler angles that the splines run through turn too fast."""
 TURN_LIMIT_DEG = 90.0
 """Between neighbouring poses; beyond it nobody knows which way the vehicle turned."""
-ACCELERATION_LIMIT_MPS2 = 50.0
-RATE_LIMIT_RADPS = 10.0
+ACCELERATION_LIMIT_M_S2 = 50.0
+RATE_LIMIT_RAD_S = 10.0
 CHECK_S = 0.01
 
 
@@ -128,8 +128,8 @@ def _check_motion(source: str, motion: Motion, scenario: Scenario) -> None:
     """Refuse what no vehicle does: it is the poses' noise, or a jump between them."""
     t_s = np.arange(*scenario.reach_s, CHECK_S)
     for what, values, limit, unit in (
-        ("an acceleration", motion.acceleration(t_s), ACCELERATION_LIMIT_MPS2, "m/s²"),
-        ("a turning rate", motion.attitude(t_s)[1], RATE_LIMIT_RADPS, "rad/s"),
+        ("an acceleration", motion.acceleration(t_s), ACCELERATION_LIMIT_M_S2, "m/s²"),
+        ("a turning rate", motion.attitude(t_s)[1], RATE_LIMIT_RAD_S, "rad/s"),
     ):
         size = np.linalg.norm(values, axis=1)
         worst = int(np.argmax(size))

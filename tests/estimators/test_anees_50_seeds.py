@@ -55,7 +55,7 @@ def test_anees_over_50_seeds_lies_in_its_interval(name: str, path: str) -> None:
             rows = np.searchsorted(track.t_ns, log.start_ns + EPOCHS_S * 10**9)
             errors.setdefault(output, []).append(error_state(truth, track)[rows])
             covariances.setdefault(output, []).append(track.P[rows])
-    assert list(errors) == (["online", "hindsight"] if name in ("rts", "fls", "batch") else ["online"])
+    assert list(errors) == (["online", "smoothed"] if name in ("rts", "fls", "batch") else ["online"])
     for output in errors:
         e_all, P_all = np.array(errors[output]), np.array(covariances[output])
         assert e_all.shape == (SEEDS, len(EPOCHS_S), 15)

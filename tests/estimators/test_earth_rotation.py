@@ -294,7 +294,7 @@ SENSORS = {"dvl": DvlSpec(2.5), "depth": DepthSpec(5.0), "heading": HeadingSpec(
 @pytest.fixture
 def spun(monkeypatch: pytest.MonkeyPatch) -> Log:
     """A minute of the navigation grade on an Earth that turns, for as long as a test, SPIN times too fast."""
-    monkeypatch.setattr(rig_module, "EARTH_RATE_RADPS", SPIN * rig_module.EARTH_RATE_RADPS)
+    monkeypatch.setattr(rig_module, "EARTH_RATE_RAD_S", SPIN * rig_module.EARTH_RATE_RAD_S)
     prior = PriorSpec(attitude_deg=0.05)  # near enough for all to be linear
     scenario = Scenario(duration_s=60.0, imu="navigation", latitude_deg=50.0, prior=prior, **SMALL, **SENSORS)
     return simulate(scenario, seed=3)
@@ -331,14 +331,14 @@ def test_all_estimators_are_one_on_a_turning_earth(spun: Log, name: str, options
 
 @pytest.mark.parametrize("options", [{}, {"keyframe_period_s": 2.0}], ids=str)
 def test_with_hindsight_too(spun: Log, options: dict[str, float]) -> None:
-    assert apart(spun, "batch", "rts", "hindsight", **options) < 0.1
+    assert apart(spun, "batch", "rts", "smoothed", **options) < 0.1
 
 
 @pytest.mark.parametrize("name", ["fls", "window"])
 @pytest.mark.parametrize("dvl", ["velocity", "preintegrated-loose", "preintegrated-tight"])
 def test_a_smoother_at_long_intervals_stays_at_the_truth(name: str, dvl: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without noise, on an Earth that turns a hundred times too fast, by DVL and depth alone."""
-    monkeypatch.setattr(rig_module, "EARTH_RATE_RADPS", 100 * rig_module.EARTH_RATE_RADPS)
+    monkeypatch.setattr(rig_module, "EARTH_RATE_RAD_S", 100 * rig_module.EARTH_RATE_RAD_S)
     scenario = Scenario(duration_s=60.0, imu="navigation", latitude_deg=50.0, noise_scale=0.0, **SMALL)
     log = simulate(scenario, seed=3)
     options = {"dvl": [dvl], "dvl_between": "straight", "keyframe_period_s": 1.0, "factors": ["dvl", "depth"]}
@@ -379,7 +379,7 @@ def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     ("name", "output"),
     [
         ("eskf", "online"),
-        ("rts", "hindsight"),
+        ("rts", "smoothed"),
         pytest.param("iekf", "online", marks=pytest.mark.slow),
         pytest.param("ukf", "online", marks=pytest.mark.slow),
         pytest.param("fls", "online", marks=pytest.mark.slow),

@@ -223,7 +223,7 @@ def test_ctrl_c_is_one_line_and_status_130(verb: str, tmp_path: Path, monkeypatc
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fathom.bench.execution.sweep.run_experiment", interrupted)
+    monkeypatch.setattr("fathom.bench.execution.sweep.sweep", interrupted)
     monkeypatch.setattr("fathom.datasets.simulated.simulator.simulate", interrupted)
     monkeypatch.setattr("fathom.bench.inspection.inspecting.open_to_inspect", interrupted)
     arguments = {
