@@ -379,7 +379,7 @@ def test_a_quaternion_that_is_none_is_refused_or_repaired(folder):
 
 def test_two_columns_of_one_name_are_refused(folder):
     (folder / "depth.csv").write_text("counts, counts\n20,1\n")
-    with pytest.raises(DatasetError, match="2 columns are called 'counts'"):
+    with pytest.raises(DatasetError, match="2 columns are named 'counts'"):
         open_log(folder)
 
 

@@ -1,4 +1,4 @@
-"""IMC logs: whole messages are kept, damaged ones passed over and counted, device clocks unwrapped."""
+"""IMC logs: whole messages are kept, damaged ones skipped and counted, device clocks unwrapped."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_a_corrupted_message_is_passed_over_and_counted():
     broken[21] ^= 0x10
     values, notes = depths(b"".join([*messages[:6], bytes(broken), *messages[7:]]))
     assert values == [1.0, 3.0, 4.0]
-    assert notes == ("imc: 1 stretches of corrupted messages passed over", "imc: 26 bytes belong to no whole message")
+    assert notes == ("imc: 1 stretches of corrupted messages skipped", "imc: 26 bytes belong to no whole message")
 
 
 def test_a_wrong_length_does_not_swallow_what_follows():
@@ -150,7 +150,7 @@ def test_a_truncated_tail_is_told():
 
 
 def test_junk_is_no_log():
-    with pytest.raises(DatasetError, match="not one whole IMC message"):
+    with pytest.raises(DatasetError, match="contains no whole IMC message"):
         depths(b"\x54\xfe" * 500)
 
 

@@ -18,7 +18,7 @@ from fathom.datasets.described.opening import open_log
 from fathom.datasets.formats.recording import Wanted
 from fathom.datasets.formats.ros_bag import RosRecording, shipped_definitions
 from fathom.datasets.formats.ros_messages import RosExtractor, numeric_fields, parse_definitions, short_name
-from fathom.datasets.formats.topics import Misfit
+from fathom.datasets.formats.topics import MalformedMessage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Writer as Writer1
@@ -126,7 +126,7 @@ def test_every_number_of_a_message_is_the_one_that_rosbags_finds(kind, how):
         found = extract.columns([np.array([value]) for value in extract(data)])
         assert {path: values[0] for path, values in found.items()} == {path: at(message, path) for path in paths}
         for cut in (data[:-1] if how == "ros1" else data[:-4], data + bytes(4)):
-            with pytest.raises((Misfit, struct.error)):
+            with pytest.raises((MalformedMessage, struct.error)):
                 extract(cut)
 
 
