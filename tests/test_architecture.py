@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -128,3 +129,53 @@ def test_the_command_line_imports_nothing_heavy_at_its_top() -> None:
         named |= {node.module or "" for node in top if isinstance(node, ast.ImportFrom) and not node.level}
         assert not {name.split(".")[0] for name in named} & HEAVY
         assert not [node for node in top if isinstance(node, ast.ImportFrom) and node.level > 1]
+
+
+TO_BE_EXPLAINED = ("bench/cli", "bench/output", "bench/results", "bench/timing", "bench/tuning", "estimators")
+
+
+def constants(path: Path) -> Iterator[tuple[str, bool]]:
+    """Every numeric constant of a module, and whether a docstring or a comment (above it or its block) explains it."""
+    lines, body = path.read_text(encoding="utf-8").splitlines(), ast.parse(path.read_text(encoding="utf-8")).body
+    for node, after in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None or not holds_a_number(node.value):
+            continue
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        named = [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+        if not named or not all(name.lstrip("_").isupper() for name in named):
+            continue
+        above = next((line for line in lines[node.lineno - 2 :: -1] if not re.match(r"[A-Z_]+ = ", line)), "")
+        beside = "\n".join(lines[node.lineno - 1 : node.end_lineno])
+        said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and type(after.value.value) is str
+        yield ", ".join(named), said or "#" in beside or above.startswith("#")
+
+
+def holds_a_number(value: ast.expr) -> bool:
+    """Whether a value is made of numbers: 3, -1, 1 << 20, (4.2, 2.7), DEGREE / 60, {"imu": 0.1}, np.arange(0, 3)."""
+    if isinstance(value, ast.Constant):
+        return isinstance(value.value, int | float) and not isinstance(value.value, bool)
+    if isinstance(value, ast.UnaryOp):
+        return holds_a_number(value.operand)
+    if isinstance(value, ast.BinOp):
+        return any(holds_a_number(side) for side in (value.left, value.right))
+    if isinstance(value, ast.Tuple | ast.List):
+        return bool(value.elts) and all(map(holds_a_number, value.elts))
+    if isinstance(value, ast.Dict):
+        return bool(value.values) and all(map(holds_a_number, value.values))
+    return isinstance(value, ast.Call) and bool(value.args) and all(map(holds_a_number, value.args))
+
+
+EXPLAINED = [path for path in SOURCES if not path.relative_to(ROOT).as_posix().startswith(TO_BE_EXPLAINED)]
+
+
+@pytest.mark.parametrize("path", EXPLAINED, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_number_at_the_top_of_a_module_has_a_reason(path: Path) -> None:
+    assert not [name for name, has_a_reason in constants(path) if not has_a_reason]
+
+
+def test_a_number_without_a_reason_is_seen(tmp_path: Path) -> None:
+    module = tmp_path / "module.py"
+    module.write_text(
+        'A = 3\nB = 2.5\n"""m/s, from the data sheet."""\nC = 1 << 20  # bytes\nD = (1.0, -2.0)\nE = "x"\n'
+    )
+    assert dict(constants(module)) == {"A": False, "B": True, "C": True, "D": False}
