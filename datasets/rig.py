@@ -10,7 +10,7 @@ import numpy as np
 from .errors import DatasetError
 from .state import Array
 
-EARTH_RATE_RADPS = 7.292115e-5
+EARTH_RATE_RAD_S = 7.292115e-5
 """rad/s, from WGS 84: 15.04 °/h."""
 
 
@@ -85,4 +85,4 @@ class Rig:
                 "in a scenario, or leave `earth_rotation` out"
             )
         latitude = math.radians(self.latitude_deg)
-        return EARTH_RATE_RADPS * np.array([0.0, math.cos(latitude), math.sin(latitude)])
+        return EARTH_RATE_RAD_S * np.array([0.0, math.cos(latitude), math.sin(latitude)])

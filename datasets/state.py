@@ -27,6 +27,7 @@ ACCEL_BIAS = slice(9, 12)
 GYRO_BIAS = slice(12, 15)
 DIM = 15
 """Components of the error."""
+"""Components of the error."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,7 +83,7 @@ def _connected(address: str, jobs: int) -> Iterator[Client]:
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=CRITICAL,
-                preload=[f"{__package__}.remote"],
+                preload=[f"{__package__}.dask_worker"],
             ) as cluster,
             Client(cluster, set_as_default=False) as client,
         ):

@@ -77,7 +77,7 @@ def do(sweep: str, task: bytes) -> Finished:
             _Held.worker, _Held.sweep = Worker(), sweep
         worker = _Held.worker
         worker.begin(_with_data_here(pickle.loads(task)))
-        wait([worker.connection], max(0.0, worker.give_up_s - monotonic()))
+        wait([worker.child.connection], max(0.0, worker.give_up_s - monotonic()))
         finished = worker.collect()
         if worker.task is not None:  # it did not survive
             _let_go()
@@ -89,7 +89,7 @@ def dismiss(sweep: str) -> None:
     worker = _Held.worker
     if worker is None or _Held.sweep != sweep:
         return
-    worker.process.kill()  # a `do` that waits for it ends, and lets go of it
+    worker.child.process.kill()  # a `do` that waits for it ends, and lets go of it
     if _Held.lock.acquire(blocking=False):
         try:
             _let_go()
@@ -99,7 +99,7 @@ def dismiss(sweep: str) -> None:
 
 def _let_go() -> None:
     if _Held.worker is not None:
-        _Held.worker.kill()
+        _Held.worker.child.kill()
         _Held.worker = None
 
 

@@ -206,7 +206,7 @@ def reproduce(runs: Sequence[Stored], data: Path | str | None = None, jobs: int 
 
 
 def _readings_sha256(log: str, data: Path | None, repair: bool) -> str:
-    return content_sha256(LogSpec(log=log).open(None, data, repair))
+    return content_sha256(LogSpec(log, log=log).open(None, data, repair))
 
 
 def _as_stored(row: Row) -> Record:

@@ -6,8 +6,6 @@ import ctypes
 import gc
 import json
 import math
-import os
-import threading
 from collections import OrderedDict
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -35,18 +33,6 @@ from .task import Finished, Task, file_name, parquet
 
 LOGS_KEPT = 2
 """How many logs a worker keeps in memory, so that estimators share them."""
-
-
-def main(descriptor: int) -> None:
-    """Be a worker process: do the tasks that come through a connection, as long as there is a parent."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    work(Connection(descriptor))
-
-
-def _end_with_parent() -> None:
-    """Wait until the standard input closes, as it does when the parent is gone, however it went; then end at once."""
-    os.read(0, 1)
-    os._exit(1)
 
 
 def work(connection: Connection) -> None:

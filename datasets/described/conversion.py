@@ -458,7 +458,7 @@ def _dvl(opening: _Opening, part: d.DvlDescription) -> DvlStream:
     v_S, sigma = np.zeros((len(values), 3)), np.full((len(values), 3), np.inf)
     v_S[:, measured], sigma[:, measured] = values, _sigma(rows, part, len(measured))
     v_S = _flu(v_S, part.axes)
-    if part.mounting != d.MountingDescription():
+    if part.mounting != d.MountingSpec():
         R_BS = part.mounting.mounting().R_BS
         v_S, sigma = v_S @ R_BS.T, _turned(sigma, R_BS)
     return DvlStream(rows.t_ns, rows.received_ns, v_S, sigma)

@@ -7,24 +7,23 @@ checks that need no data are made here, so no data is read before the whole desc
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 import yaml
 from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_validator
-from scipy.spatial.transform import Rotation
 
-from ..errors import DatasetError, nearest
+from ..errors import DatasetError, complaints, nearest
 from ..formats.columns import Column, Part, Table
 from ..formats.recording import Recording, loader
+from ..mounting import Matrix, MountingSpec
 from ..quantities import Finite, NotNegative, Positive, Vector
-from ..rig import ImuNoise, Mounting
+from ..rig import ImuNoise
 from ..state import LIMIT_NS, Array, Belief, NavState
 
 Sigma = Annotated[float, Field(gt=0)]
 Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
 """A shift of a time, s: at most 73 years, so that no sum overflows."""
-Matrix = tuple[Vector, Vector, Vector]
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
@@ -207,34 +206,6 @@ class Outliers(Part):
     """Which, from 0; all when left out."""
 
 
-class MountingDescription(Part):
-    """Pose of a sensor's axes (FRD already turned to FLU) on the body FLU: R_BS = Rz(yaw) Ry(pitch) Rx(roll)."""
-
-    translation_m: Vector = (0.0, 0.0, 0.0)
-    roll_deg: Finite = 0.0
-    pitch_deg: Finite = 0.0
-    yaw_deg: Finite = 0.0
-    R_BS: Matrix | None = None
-    """Instead of the angles: the rotation itself, by rows."""
-
-    @model_validator(mode="after")
-    def _is_a_mounting(self) -> Self:
-        if self.R_BS is not None and (self.roll_deg or self.pitch_deg or self.yaw_deg):
-            raise ValueError("give R_BS or the angles, not both")
-        self.mounting()
-        return self
-
-    def mounting(self) -> Mounting:
-        """Return the mounting, in our types."""
-        p_BS_B = np.array(self.translation_m)
-        if self.R_BS is not None:
-            return Mounting(np.array(self.R_BS), p_BS_B)
-        angles_deg = [self.yaw_deg, self.pitch_deg, self.roll_deg]
-        if not any(angles_deg):
-            return Mounting(np.eye(3), p_BS_B)
-        return Mounting(Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix(), p_BS_B)
-
-
 class NoiseDescription(Part):
     """The IMU's noise, equal on three axes; `ImuNoise` has the units."""
 
@@ -280,7 +251,7 @@ class ImuDescription(StreamDescription):
     accel_source: SourceDescription | None = None
     """Source of the accelerometer's rows, if not the gyro's; they are interpolated linearly to the gyro's times."""
     axes: Literal["FLU", "FRD"] = "FLU"
-    mounting: MountingDescription = MountingDescription()
+    mounting: MountingSpec = MountingSpec()
     noise: NoiseDescription
 
 
@@ -305,7 +276,7 @@ class DvlDescription(AidingDescription):
     measures: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
     """The axes of the columns of `velocity` (and of `sigma`). An axis left out is unmeasured: its sigma is infinite."""
     axes: Literal["FLU", "FRD"] = "FLU"
-    mounting: MountingDescription = MountingDescription()
+    mounting: MountingSpec = MountingSpec()
     """Rotates the velocity into B's axes; its translation must be zero, since the DVL is B's origin."""
     sigma_m_s: Sigma | tuple[Sigma, ...] | None = None
     sigma: Speeds | None = None
@@ -320,7 +291,7 @@ class DvlDescription(AidingDescription):
             raise ValueError(f"sigma_m_s: expected {len(self.measures)} numbers, found {len(self.sigma_m_s)}")
         if any(self.mounting.translation_m):
             raise ValueError("mounting: the DVL is the origin of B; give the other sensors' translations from there")
-        if self.mounting != MountingDescription() and len(self.measures) < 3:
+        if self.mounting != MountingSpec() and len(self.measures) < 3:
             raise ValueError("mounting: only a velocity measured along all three axes can be rotated")
         return self
 
@@ -333,7 +304,7 @@ class DepthDescription(AidingDescription):
     positive: Literal["up", "down"] = "down"
     sigma_m: Sigma | None = None
     sigma: Height | None = None
-    mounting: MountingDescription = MountingDescription()
+    mounting: MountingSpec = MountingSpec()
 
 
 class Placed(Part):
@@ -363,7 +334,7 @@ class GpsDescription(AidingDescription, Placed):
     sigma_m: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
     """East, north, up; .inf for a component that was not measured. Without a height the third is .inf."""
     sigma: Lengths | None = None
-    mounting: MountingDescription = MountingDescription()
+    mounting: MountingSpec = MountingSpec()
 
     @model_validator(mode="after")
     def _somewhere(self) -> Self:
@@ -384,7 +355,7 @@ class HeadingDescription(AidingDescription):
     attitude: Attitude | None = None
     sigma_deg: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
     sigma: Angle | Angles | None = None
-    mounting: MountingDescription = MountingDescription()
+    mounting: MountingSpec = MountingSpec()
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
@@ -569,8 +540,7 @@ def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        lines = [_complaint(problem, model, above) for problem in error.errors(include_url=False)]
-        raise DatasetError(f"{where}: " + f"\n{where}: ".join(dict.fromkeys(lines))) from None
+        raise DatasetError(f"{where}: " + f"\n{where}: ".join(complaints(error, model, above))) from None
     except (RecursionError, OverflowError) as error:
         raise DatasetError(f"{where}: cannot be understood: {error}") from None
 
@@ -582,30 +552,3 @@ def _loader(recording: dict[Any, Any], where: str) -> type[Recording]:
         return loader(recording["format"])
     except DatasetError as error:
         raise DatasetError(f"{where}: `recording.format`: {error}") from None
-
-
-def _complaint(problem: Any, model: type[BaseModel], above: tuple[str, ...]) -> str:
-    """Turn one of pydantic's errors into a sentence with the key's path; `model` stands at `above`."""
-    loc: tuple[Any, ...] = problem["loc"]
-    path = ".".join(str(step) for step in (*above, *loc)) or "top level"
-    if problem["type"] == "extra_forbidden":
-        known = _known_keys(loc[:-1], model)
-        return f"unknown key `{path}`{nearest(str(loc[-1]), known)} (known: {', '.join(known)})"
-    if problem["type"] == "missing":
-        return f"missing key `{path}`"
-    message = problem["msg"].removeprefix("Value error, ")
-    found = "" if isinstance(problem["input"], dict | BaseModel) else f", found {str(problem['input'])[:60]!r}"
-    return f"`{path}`: {message}{found}"
-
-
-def _known_keys(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
-    """Return the keys of the model that stands at `loc` under `model`."""
-    for step in loc:
-        info = model.model_fields.get(str(step))
-        if info is None:
-            continue
-        choices = [info.annotation, *get_args(info.annotation)]
-        models = [c for c in choices if isinstance(c, type) and issubclass(c, BaseModel)]
-        if models:
-            model = models[-1]
-    return list(model.model_fields)

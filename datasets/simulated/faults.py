@@ -70,21 +70,21 @@ class DvlFaults(Faults):
         scale: of the velocity it reads to the true one: a wrong speed of sound.
         misalignment_deg: roll, pitch and yaw of its true axes in B, which the rig says are B's.
         lever_arm_error_m: where it really is, in B; the rig says at its origin.
-        limit_mps: what no component of a reading exceeds.
-        quantum_mps: to the nearest multiple of which each component is rounded.
+        limit_m_s: what no component of a reading exceeds.
+        quantum_m_s: to the nearest multiple of which each component is rounded.
     """
 
-    outlier_mps: NotNegative = 1.0
+    outlier_m_s: NotNegative = 1.0
     scale: Positive = 1.0
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
     lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
-    limit_mps: Positive | None = None
-    quantum_mps: NotNegative = 0.0
+    limit_m_s: Positive | None = None
+    quantum_m_s: NotNegative = 0.0
 
     @property
     def marring(self) -> Marring:
         """In m/s."""
-        return Marring(self.outlier_mps, _none_is_infinite(self.limit_mps), self.quantum_mps)
+        return Marring(self.outlier_m_s, _none_is_infinite(self.limit_m_s), self.quantum_m_s)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -156,20 +156,20 @@ class ImuFaults(Faults):
         gyro_scale, accel_scale: of what each axis reads to the truth, before bias and noise.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
         lever_arm_error_m: where it really is, less where the rig says, in B.
-        gyro_limit_dps, accel_limit_mps2: where a sample saturates; it is the mean over an interval that is clipped.
-        gyro_quantum_dps, accel_quantum_mps2: to the nearest multiple of which a sample is rounded.
+        gyro_limit_deg_s, accel_limit_m_s2: where a sample saturates; it is the mean over an interval that is clipped.
+        gyro_quantum_deg_s, accel_quantum_m_s2: to the nearest multiple of which a sample is rounded.
     """
 
-    gyro_outlier_dps: NotNegative = 20.0
-    accel_outlier_mps2: NotNegative = 5.0
+    gyro_outlier_deg_s: NotNegative = 20.0
+    accel_outlier_m_s2: NotNegative = 5.0
     gyro_scale: Vector = (1.0, 1.0, 1.0)
     accel_scale: Vector = (1.0, 1.0, 1.0)
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
     lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
-    gyro_limit_dps: Positive | None = None
-    accel_limit_mps2: Positive | None = None
-    gyro_quantum_dps: NotNegative = 0.0
-    accel_quantum_mps2: NotNegative = 0.0
+    gyro_limit_deg_s: Positive | None = None
+    accel_limit_m_s2: Positive | None = None
+    gyro_quantum_deg_s: NotNegative = 0.0
+    accel_quantum_m_s2: NotNegative = 0.0
 
     @property
     def marring(self) -> Marring:
@@ -179,9 +179,9 @@ class ImuFaults(Faults):
             return np.repeat([accel, gyro * DEGREE], 3)
 
         return Marring(
-            six(self.accel_outlier_mps2, self.gyro_outlier_dps),
-            six(_none_is_infinite(self.accel_limit_mps2), _none_is_infinite(self.gyro_limit_dps)),
-            six(self.accel_quantum_mps2, self.gyro_quantum_dps),
+            six(self.accel_outlier_m_s2, self.gyro_outlier_deg_s),
+            six(_none_is_infinite(self.accel_limit_m_s2), _none_is_infinite(self.gyro_limit_deg_s)),
+            six(self.accel_quantum_m_s2, self.gyro_quantum_deg_s),
         )
 
     @property

@@ -39,8 +39,8 @@ def read_dvl(
     v_WD_D = spec.faults.scale * v_WD_B @ dvl.R_BS
 
     A = janus_beams(spec.beam_angle_deg * DEGREE)
-    beam_error = spec.beam_sigma_mps * random_stream(seed, "dvl").standard_normal((len(t_s), 4))
-    error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, spec.beam_sigma_mps), (len(t_s), 1))
+    beam_error = spec.beam_sigma_m_s * random_stream(seed, "dvl").standard_normal((len(t_s), 4))
+    error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, spec.beam_sigma_m_s), (len(t_s), 1))
     if scenario.seabed is None and spec.max_tilt_deg is None and not spec.beam_loss_probability:
         return v_WD_D, error, sigma
 
@@ -48,14 +48,14 @@ def read_dvl(
     for lost in range(4):
         rows, others = ~locked[:, lost] & (locked.sum(axis=1) == 3), np.arange(4) != lost
         error[rows] = beam_error[rows][:, others] @ np.linalg.inv(A[others]).T
-        sigma[rows] = figure_of_merit(A[others], spec.beam_sigma_mps)
+        sigma[rows] = figure_of_merit(A[others], spec.beam_sigma_m_s)
     enough = locked.sum(axis=1) >= (3 if spec.three_beams else 4)
     return np.where(enough[:, None], v_WD_D, np.nan), error, sigma
 
 
-def figure_of_merit(A: Array, beam_sigma_mps: float) -> Array:
+def figure_of_merit(A: Array, beam_sigma_m_s: float) -> Array:
     """Return the standard deviation of each component of the velocity that beams A (m, 3) give, (3,) m/s."""
-    return beam_sigma_mps * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
+    return beam_sigma_m_s * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
 
 
 def bottom_lock(scenario: Scenario, spec: DvlSpec, R_WD: Array, p_WD_W: Array, seed: int) -> NDArray[np.bool_]:

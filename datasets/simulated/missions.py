@@ -56,12 +56,12 @@ def draw(scenario: Scenario, rng: np.random.Generator, sea: Sea | None = None) -
     t_s = np.arange(-MARGIN_S, scenario.duration_s + MARGIN_S, KNOT_S)
     rock = wobble(t_s, rng)
 
-    speed = scenario.speed_mps * (1 + SPEED_WOBBLE * rock[:, 3])
+    speed = scenario.speed_m_s * (1 + SPEED_WOBBLE * rock[:, 3])
     vertical = -smooth(np.gradient(depth_profile(scenario, plan, t_s), KNOT_S))
     horizontal = np.sqrt(speed**2 - vertical**2)
     travelled_m = np.cumsum(horizontal) * KNOT_S
     course = smooth(course_profile(scenario, plan, travelled_m - np.interp(0.0, t_s, travelled_m)))
-    bank = np.arctan(horizontal * np.gradient(course, KNOT_S) / scenario.gravity_mps2)
+    bank = np.arctan(horizontal * np.gradient(course, KNOT_S) / scenario.gravity_m_s2)
 
     v_WB_W = np.stack([horizontal * np.cos(course), horizontal * np.sin(course), vertical], axis=1)
     angles = np.stack([-bank, -np.arcsin(vertical / speed), course], axis=1)
@@ -91,10 +91,10 @@ def depth_profile(scenario: Scenario, plan: Plan, t_s: Array) -> Array:
     legs = max(1, round(scenario.duration_s / scenario.surface_every_s))
     period_s = scenario.duration_s / legs
     half_s = min(scenario.surface_for_s / 2, period_s / 4)
-    rate_mps = scenario.speed_mps * math.sin(climb_angle(scenario, plan))
+    rate_m_s = scenario.speed_m_s * math.sin(climb_angle(scenario, plan))
     phase_s = np.mod(t_s, period_s)
-    dived_m = rate_mps * np.maximum(0.0, phase_s - half_s)
-    to_climb_m = rate_mps * np.maximum(0.0, period_s - phase_s - half_s)
+    dived_m = rate_m_s * np.maximum(0.0, phase_s - half_s)
+    to_climb_m = rate_m_s * np.maximum(0.0, period_s - phase_s - half_s)
     run_m = np.minimum(dived_m, scenario.depth_m)
     if plan.sawtooth:
         span_m = scenario.depth_m - scenario.shallow_m

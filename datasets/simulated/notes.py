@@ -29,7 +29,7 @@ def _world(scenario: Scenario) -> list[str]:
 
 
 def _biases(scenario: Scenario) -> list[str]:
-    correlation_s = scenario.imu_bias_correlation_s
+    correlation_s = scenario.imu.bias_correlation_s
     return [] if correlation_s is None else [f"imu biases: Gauss–Markov, correlated over {correlation_s:g} s."]
 
 

@@ -20,13 +20,14 @@ if TYPE_CHECKING:
 
 DEGREE_OF_SPLINES = 5
 """Quintic, as in `missions`: accelerations and angular accelerations are then smooth."""
+"""Quintic, as in `missions`: accelerations and angular accelerations are then smooth."""
 STEEPEST_DEG = 80.0
 """Beyond this pitch the Euler angles change too fast for the splines."""
 TURN_LIMIT_DEG = 90.0
 """Between neighbouring poses; beyond it the direction of the turn is ambiguous."""
-ACCELERATION_LIMIT_MPS2 = 50.0
+ACCELERATION_LIMIT_M_S2 = 50.0
 """5 g: no underwater vehicle reaches it, and a jump of 10 cm between poses at 20 Hz does."""
-RATE_LIMIT_RADPS = 10.0
+RATE_LIMIT_RAD_S = 10.0
 """570 °/s: faster than any underwater vehicle turns."""
 CHECK_S = 0.01
 """Spacing of the times at which these limits are checked, the period of a 100 Hz IMU."""
@@ -131,8 +132,8 @@ def _check_motion(source: str, motion: Motion, scenario: Scenario) -> None:
     """Refuse accelerations and rates beyond any vehicle's: they are noise of the poses, or a jump between them."""
     t_s = np.arange(*scenario.reach_s, CHECK_S)
     for what, values, limit, unit in (
-        ("an acceleration", motion.acceleration(t_s), ACCELERATION_LIMIT_MPS2, "m/s²"),
-        ("a turning rate", motion.attitude(t_s)[1], RATE_LIMIT_RADPS, "rad/s"),
+        ("an acceleration", motion.acceleration(t_s), ACCELERATION_LIMIT_M_S2, "m/s²"),
+        ("a turning rate", motion.attitude(t_s)[1], RATE_LIMIT_RAD_S, "rad/s"),
     ):
         size = np.linalg.norm(values, axis=1)
         worst = int(np.argmax(size))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 COMPONENTS = 16
 """Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
+"""Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +31,14 @@ class Sea:
     """Waves and tide.
 
     Attributes:
-        amplitude_m, frequency_radps, phase_rad: (m,) of each wave.
+        amplitude_m, frequency_rad_s, phase_rad: (m,) of each wave.
         direction: (2,) unit vector in which they run.
         gravity: m/s²; deep water: the wave number is frequency² / gravity.
         tide: the tide, or None.
     """
 
     amplitude_m: Array
-    frequency_radps: Array
+    frequency_rad_s: Array
     phase_rad: Array
     direction: Array
     gravity: float
@@ -46,7 +47,7 @@ class Sea:
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> Sea | None:
         """Return the sea of a scenario, or None where it is flat."""
-        waves, gravity = scenario.waves, scenario.gravity_mps2
+        waves, gravity = scenario.waves, scenario.gravity_m_s2
         if waves is None:
             nothing = np.zeros(0)
             flat = scenario.tide is None
@@ -90,7 +91,7 @@ class Sea:
 
     def _waves(self, t_s: Array, p_W: Array) -> tuple[Array, Array, Array]:
         """Return a e^kz and k · x − ω t + φ, (n, m), and k (m,)."""
-        k = self.frequency_radps**2 / self.gravity
+        k = self.frequency_rad_s**2 / self.gravity
         depth = np.minimum(p_W[:, 2] - self.tide_m(t_s), 0.0)
-        phase = np.outer(p_W[:, :2] @ self.direction, k) - np.outer(t_s, self.frequency_radps) + self.phase_rad
+        phase = np.outer(p_W[:, :2] @ self.direction, k) - np.outer(t_s, self.frequency_rad_s) + self.phase_rad
         return self.amplitude_m * np.exp(np.outer(depth, k)), phase, k

@@ -294,7 +294,7 @@ SENSORS = {"dvl": DvlSpec(2.5), "depth": DepthSpec(5.0), "heading": HeadingSpec(
 @pytest.fixture
 def spun(monkeypatch: pytest.MonkeyPatch) -> Log:
     """A minute of the navigation grade on an Earth that turns, for as long as a test, SPIN times too fast."""
-    monkeypatch.setattr(rig_module, "EARTH_RATE_RADPS", SPIN * rig_module.EARTH_RATE_RADPS)
+    monkeypatch.setattr(rig_module, "EARTH_RATE_RAD_S", SPIN * rig_module.EARTH_RATE_RAD_S)
     prior = PriorSpec(attitude_deg=0.05)  # near enough for all to be linear
     scenario = Scenario(duration_s=60.0, imu="navigation", latitude_deg=50.0, prior=prior, **SMALL, **SENSORS)
     return simulate(scenario, seed=3)
@@ -338,7 +338,7 @@ def test_with_hindsight_too(spun: Log, options: dict[str, float]) -> None:
 @pytest.mark.parametrize("dvl", ["velocity", "preintegrated-loose", "preintegrated-tight"])
 def test_a_smoother_at_long_intervals_stays_at_the_truth(name: str, dvl: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without noise, on an Earth that turns a hundred times too fast, by DVL and depth alone."""
-    monkeypatch.setattr(rig_module, "EARTH_RATE_RADPS", 100 * rig_module.EARTH_RATE_RADPS)
+    monkeypatch.setattr(rig_module, "EARTH_RATE_RAD_S", 100 * rig_module.EARTH_RATE_RAD_S)
     scenario = Scenario(duration_s=60.0, imu="navigation", latitude_deg=50.0, noise_scale=0.0, **SMALL)
     log = simulate(scenario, seed=3)
     options = {"dvl": [dvl], "dvl_between": "straight", "keyframe_period_s": 1.0, "factors": ["dvl", "depth"]}

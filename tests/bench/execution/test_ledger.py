@@ -188,10 +188,9 @@ def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
 KILLED = """
 import json, os, random, signal, sqlite3, sys, time
 from contextlib import closing
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from multiprocessing import Pipe, get_context
 from pathlib import Path
-from fathom.bench import runner, task, workers, working
+from fathom.bench.execution import pool, sweep, task, worker
 from fathom.bench.experiment.plan import Experiment
 
 plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
@@ -199,18 +198,22 @@ plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[
 
 class Forked:
     # a worker's process as the child of a warm one, which starts at once
-    stdin = None
 
-    def __init__(self, descriptor):
-        theirs = Connection(os.dup(descriptor))
-        self.process = get_context("fork").Process(target=working.work, args=(theirs,), daemon=True)
+    def __init__(self, target):
+        self.connection, theirs = Pipe()
+        self.process = get_context("fork").Process(target=worker.work, args=(theirs,), daemon=True)
         self.process.start()
-        self.kill, self.wait = self.process.kill, self.process.join
+        theirs.close()
+
+    def kill(self):
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
 
 
-workers.start = Forked
+pool.start = Forked
 for run in plan.runs()[:2]:
-    working.Bench().execute(task.Task.of(plan, run))
+    worker.Bench().execute(task.Task.of(plan, run))
 
 
 def held():
@@ -227,7 +230,7 @@ for _ in range(kills):
     child = os.fork()
     if child == 0:
         os.setsid()
-        runner.run_experiment(plan, out=out, jobs=2)
+        sweep.run_experiment(plan, out=out, jobs=2)
         os._exit(0)
     if longest_s is None:  # how long is a moment on this machine, as busy as it is
         while len(held()) < 6:

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 FATHOM = Path(sys.executable).with_name("fathom")
-UPRIGHT = {"imu_mounting": {"roll_pitch_yaw_deg": [0, 0, 0], "lever_arm_m": [0, 0, 0]}}
+UPRIGHT = {"imu": {"mounting": {}}}
 
 
 @functools.lru_cache(maxsize=4)
@@ -69,8 +69,8 @@ def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str)
         {"mission": "helix", "imu": "tactical"},
         {"mission": "box", "imu": "navigation"},
         {"mission": "transit", "imu": "navigation", "waves": {"height_m": 0.5}},
-        {"mission": "helix", "speed_mps": 3.0, "turn_radius_m": 8.0, "imu": "navigation", "duration_s": 300},
-        {"latitude_deg": 60.0, "imu_rate_hz": 50.0, "imu_bias_correlation_s": 100.0, "tide": {"amplitude_m": 1.0}},
+        {"mission": "helix", "speed_m_s": 3.0, "turn_radius_m": 8.0, "imu": "navigation", "duration_s": 300},
+        {"latitude_deg": 60.0, "imu": {"rate_hz": 50.0, "bias_correlation_s": 100.0}, "tide": {"amplitude_m": 1.0}},
         {"dvl": {"rate_hz": 25.0}, "depth": {"rate_hz": 50.0}, "heading": {"rate_hz": 50.0}},
         {"dvl": {"rate_hz": 1.0}, "depth": {"rate_hz": 1.0}, "heading": {"rate_hz": 1.0}},
     ],
@@ -96,10 +96,10 @@ def test_nothing_looks_wrong_in_a_full_attitude() -> None:
 FAULTS: list[tuple[str, dict[str, Any], str]] = [
     ("imu", {"dropout_probability": 0.02}, "readings are missing"),
     ("imu", {"outages_s": [[40, 42]]}, "silence of more than 0.1 s; the longest is 2.02 s, from 40.0 s"),
-    ("imu", {"gyro_limit_dps": 4.0}, "gyro z is clipped"),
-    ("imu", {"accel_limit_mps2": 9.8}, "accel z is clipped"),
-    ("imu", {"gyro_quantum_dps": 0.5}, "comes in steps of 0.00873 rad/s"),
-    ("imu", {"accel_quantum_mps2": 0.1}, "comes in steps of 0.1 m/s²"),
+    ("imu", {"gyro_limit_deg_s": 4.0}, "gyro z is clipped"),
+    ("imu", {"accel_limit_m_s2": 9.8}, "accel z is clipped"),
+    ("imu", {"gyro_quantum_deg_s": 0.5}, "comes in steps of 0.00873 rad/s"),
+    ("imu", {"accel_quantum_m_s2": 0.1}, "comes in steps of 0.1 m/s²"),
     ("imu", {"accel_scale": [1.05, 1.05, 1.05]}, "Scale or bias"),
     ("imu", {"misalignment_deg": [90, 0, 0]}, "points 90° off"),
     ("imu", {"misalignment_deg": [180, 0, 0]}, "points down in the body"),
@@ -107,10 +107,10 @@ FAULTS: list[tuple[str, dict[str, Any], str]] = [
     ("dvl", {"outages_s": [[40, 60]]}, "silence of more than 5 s; the longest is 20.4 s, from 39.8 s"),
     ("dvl", {"outlier_probability": 0.02}, "stand out of their neighbours"),
     ("dvl", {"repeat_probability": 0.05}, "say exactly what the one before said"),
-    ("dvl", {"limit_mps": 1.52}, "dvl x is clipped"),
-    ("dvl", {"limit_mps": 1.2}, "dvl x is 1.2 m/s in every row"),
-    ("dvl", {"quantum_mps": 0.1}, "take only 3 values"),
-    ("dvl", {"quantum_mps": 0.02}, "take only 9 values"),
+    ("dvl", {"limit_m_s": 1.52}, "dvl x is clipped"),
+    ("dvl", {"limit_m_s": 1.2}, "dvl x is 1.2 m/s in every row"),
+    ("dvl", {"quantum_m_s": 0.1}, "take only 3 values"),
+    ("dvl", {"quantum_m_s": 0.02}, "take only 9 values"),
     ("depth", {"dropout_probability": 0.15}, "readings are missing"),
     ("depth", {"outages_s": [[80, 100]]}, "silence of more than 5 s; the longest is 20.1 s, from 79.9 s"),
     ("depth", {"outlier_probability": 0.02}, "stand out of their neighbours"),
@@ -131,7 +131,7 @@ FAULTS: list[tuple[str, dict[str, Any], str]] = [
 
 @pytest.mark.parametrize(("sensor", "faults", "words"), FAULTS, ids=lambda value: str(value))
 def test_a_fault_is_found_by_name_and_nothing_else(sensor: str, faults: dict[str, Any], words: str) -> None:
-    keys = {"imu_faults": faults} if sensor == "imu" else {sensor: {"faults": faults}}
+    keys = {sensor: {"faults": faults}}
     findings = wrong(simulated(surface_for_s=60 if sensor == "gps" else 36, **keys))
     said(findings, sensor, words)
     assert len(findings) == 1 or "clipped" in words  # which befalls other axes, too
@@ -139,7 +139,7 @@ def test_a_fault_is_found_by_name_and_nothing_else(sensor: str, faults: dict[str
 
 
 @pytest.mark.parametrize(
-    "faults", [{"heading": {"faults": {"quantum_deg": 5.0}}}, {"imu_faults": {"gyro_quantum_dps": 0.5}}]
+    "faults", [{"heading": {"faults": {"quantum_deg": 5.0}}}, {"imu": {"faults": {"gyro_quantum_deg_s": 0.5}}}]
 )
 def test_what_coarse_steps_bring_about_is_no_mark_and_no_row_without_reading(faults: dict[str, Any]) -> None:
     """A heading that rests on a step far from the others' median, and a gyro that now and then rounds to zero."""
@@ -150,7 +150,7 @@ def test_what_coarse_steps_bring_about_is_no_mark_and_no_row_without_reading(fau
 
 @pytest.mark.parametrize("words", ["repeat_probability", "outlier_probability"])
 def test_gyro_and_accelerometer_are_told_apart(words: str) -> None:
-    findings = wrong(simulated(imu_faults={words: 0.02}))
+    findings = wrong(simulated(imu={"faults": {words: 0.02}}))
     assert [finding.stream for finding in findings] == ["imu", "imu"]
     assert " gyro readings" in findings[0].message
     assert " accel readings" in findings[1].message
@@ -175,8 +175,8 @@ def test_overtaken_readings_are_counted_as_they_are() -> None:
 
 
 def test_a_slow_imu_is_told() -> None:
-    assert len(wrong(simulated(imu_rate_hz=10.0))) == 1
-    said(wrong(simulated(imu_rate_hz=10.0)), "imu", "The IMU samples at 10 Hz")
+    assert len(wrong(simulated(imu={"rate_hz": 10.0}))) == 1
+    said(wrong(simulated(imu={"rate_hz": 10.0})), "imu", "The IMU samples at 10 Hz")
 
 
 def test_stamps_of_reception_are_told_by_their_bunches() -> None:

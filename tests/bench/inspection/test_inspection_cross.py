@@ -141,7 +141,9 @@ def test_odd_logs_are_checked_as_far_as_they_go() -> None:
     assert log.truth is not None
     bare = Trajectory(log.truth.t_ns[::10], np.full_like(log.truth.R_WB[::10], np.nan), log.truth.p_WB_W[::10])
     dead = ImuStream(log.imu.t_ns, 0 * log.imu.w_WI_I, 0 * log.imu.f_I + [0.0, 0.0, -9.8])
-    cut = sail(imu_faults={"outages_s": [[60, 63]]}, dvl={"faults": {"outages_s": [[100, 160]]}})
+    cut = sail(
+        imu={"noise": "industrial", "faults": {"outages_s": [[60, 63]]}}, dvl={"faults": {"outages_s": [[100, 160]]}}
+    )
     for odd in (replace(log, truth=None), replace(log, truth=bare), cut, sail(duration_s=20)):
         assert findings(odd) == []
     titles = {check.title: check for check in cross_checks(replace(log, imu=dead, dvl=None, truth=None))}
@@ -167,11 +169,11 @@ PATH, VELOCITY = "DVL against the positions of the truth", "DVL against the velo
 PLANTED: dict[str, tuple[dict[str, Any], str, str, float]] = {
     # dials, the stream found, "check: fact", its true value
     "dvl late": ({"dvl": LATE}, "dvl", CLOCK.format("dvl"), 0.4),
-    "imu late": ({"imu_faults": {"clock_offset_s": 0.4}}, "imu", CLOCK.format("dvl"), -0.4),
+    "imu late": ({"imu": {"noise": "industrial", "faults": {"clock_offset_s": 0.4}}}, "imu", CLOCK.format("dvl"), -0.4),
     "dvl scale": ({"dvl": {"faults": {"scale": 1.03}}}, "dvl", f"{PATH}: scale that the DVL needs", 1 / 1.03),
     "heading offset": ({"heading": {"bias_deg": -5}}, "heading", "heading against truth: heading less truth", -5.0),
     "imu turned": (
-        {"imu_faults": {"misalignment_deg": [0, 0, 5]}},  # about its own z, which is down
+        {"imu": {"noise": "industrial", "faults": {"misalignment_deg": [0, 0, 5]}}},  # about its own z, which is down
         "imu",
         "IMU against DVL: DVL's axes in the IMU's as mounted, yaw",
         5.0,
@@ -192,7 +194,7 @@ PLANTED: dict[str, tuple[dict[str, Any], str, str, float]] = {
         3.0,
     ),
     "gyro scale": (
-        {"imu_faults": {"gyro_scale": [1.1, 1.1, 1.1]}},
+        {"imu": {"noise": "industrial", "faults": {"gyro_scale": [1.1, 1.1, 1.1]}}},
         "imu",
         "gyro against heading: heading by gyro, slope",
         1 / 1.1,
@@ -220,7 +222,7 @@ def test_a_planted_fault_is_found_with_its_size(what: str) -> None:
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_lever_arm_is_found_where_turning_excites_it(seed: int) -> None:
-    checks = cross_checks(sail(seed, imu_faults={"lever_arm_error_m": [0.4, -0.3, 0.3]}))
+    checks = cross_checks(sail(seed, imu={"noise": "industrial", "faults": {"lever_arm_error_m": [0.4, -0.3, 0.3]}}))
     (check,) = (check for check in checks if check.title == "IMU against DVL")
     said = check.facts["IMU's place from the DVL"].split(", ")
     for text, true in zip(said, (-0.35 + 0.4, 0.05 - 0.3, 0.12 + 0.3), strict=True):

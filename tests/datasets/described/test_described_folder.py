@@ -482,7 +482,7 @@ def damaged(row: int, column: int, value: float) -> Any:
         ({"P": damaged(0, 0, -1e-6)}, "P is not symmetric and positive semi-definite"),
         ({"P": damaged(0, 2, 0.1)}, "P is not symmetric and positive semi-definite"),
         ({"P": (1e-6 * (2 * np.eye(15) - 1)).tolist()}, "P is not symmetric and positive semi-definite"),
-        ({"P": damaged(3, 3, float("nan"))}, "prior.P.3.3"),
+        ({"P": damaged(3, 3, float("nan"))}, r"prior.P\[3\]\[3\]"),
         ({"t_ns": 10**30}, "prior.t_ns"),
         ({"t_ns": 102 * 10**9}, r"prior: t_ns, 102.000 s, lies outside the IMU's time, 100.000 s to 101.900 s"),
         ({"t_ns": 99 * 10**9}, r"prior: t_ns, 99.000 s, lies outside the IMU's time"),

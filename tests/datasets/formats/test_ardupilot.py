@@ -17,7 +17,7 @@ from fathom.datasets.formats.ardupilot import ArduPilotRecording
 from fathom.datasets.formats.recording import Wanted
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import GpsSpec
+from fathom.datasets.simulated.specs import GpsSpec, ImuSpec
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from written_ardupilot import MESSAGES, definition, head, message, units, write_ardupilot
@@ -29,7 +29,9 @@ IMU = ("TimeUS", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
 @pytest.fixture(scope="module")
 def voyage() -> Log:
     """20 s, 50 Hz, at the surface and under, starting at an hour of uptime."""
-    scenario = Scenario(duration_s=20, imu_rate_hz=50, surface_for_s=16, start_ns=3600 * 10**9, gps=GpsSpec(rate_hz=2))
+    scenario = Scenario(
+        duration_s=20, imu=ImuSpec(rate_hz=50), surface_for_s=16, start_ns=3600 * 10**9, gps=GpsSpec(rate_hz=2)
+    )
     return simulate(scenario, seed=5)
 
 

@@ -12,9 +12,10 @@ from fathom.bench.metrics import ate, nees
 from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, Epoch, cut
 from fathom.datasets.log import DvlStream, ImuStream, ReadingStream
+from fathom.datasets.mounting import MountingSpec
 from fathom.datasets.simulated.scenario import IMU_GRADES, Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, MountingSpec
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, ImuSpec
 from fathom.estimators import FACTORS, Diverged, Pass, create
 from fathom.estimators.graph.gtsam_border import (
     carried_factor,
@@ -385,7 +386,7 @@ def test_readings_that_measure_nothing_are_counted_and_left_out(dvl: list[str]) 
 
 def test_a_dvl_that_measures_two_axes_is_used_for_two() -> None:
     """Wheels: no velocity sideways; at a lever arm the axes' noise is correlated."""
-    scenario = Scenario(duration_s=30.0, imu="consumer", imu_mounting=MountingSpec(lever_arm_m=(1.0, 1.0, 1.0)))
+    scenario = Scenario(duration_s=30.0, imu=ImuSpec("consumer", mounting=MountingSpec((1.0, 1.0, 1.0))))
     log = simulate(scenario, seed=0)
     sigma = log.dvl.sigma.copy()
     sigma[:, 1] = np.inf
@@ -434,7 +435,7 @@ def test_tight_finds_the_velocity_better_than_loose_where_the_gyro_is_worse_than
     scenario = Scenario(
         duration_s=120.0,
         imu=replace(consumer, gyro_density=10 * consumer.gyro_density),
-        dvl=DvlSpec(beam_sigma_mps=0.001),
+        dvl=DvlSpec(beam_sigma_m_s=0.001),
         depth=DepthSpec(rate_hz=0.2),
         heading=HeadingSpec(rate_hz=0.2),
     )
