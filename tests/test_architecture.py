@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -17,6 +19,8 @@ HEAVY = {"matplotlib", "pandas", "gtsam", "numba", "numpy", "scipy", "pyarrow"}
 SOURCES = [path for folder in LEVEL for path in sorted((ROOT / folder).rglob("*.py"))]
 SOURCES = [path for path in SOURCES if "__pycache__" not in path.parts]
 FOLDERS = sorted({path.parent for path in SOURCES})
+TOP = ROOT / "bench" / "fathom"
+"""Holds the `__init__` of the package `fathom` itself, which has no folder of its own at the top."""
 MOST_MODULES = 16
 """In one folder; more cannot be taken in at a glance."""
 MOST_FLOORS = 10
@@ -24,8 +28,13 @@ FRONTS = {"estimators.registry"}
 """Modules that gather a folder and those below it, as `__init__` does: a floor of their own, above both."""
 
 
-def imports(path: Path) -> Iterator[tuple[str, ...]]:
+@cache
+def imports(path: Path) -> tuple[tuple[str, ...], ...]:
     """Every module a file imports, in dotted parts; our own start with "fathom"."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[str, ...]]:
     here = ("fathom", *path.relative_to(ROOT).parts[:-1])
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -106,9 +115,25 @@ def test_no_folder_holds_more_than_can_be_taken_in(folder: Path) -> None:
     assert len(list(folder.glob("*.py"))) <= MOST_MODULES
 
 
+def test_every_folder_is_installed() -> None:
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    names = {".".join(("fathom", *folder.relative_to(ROOT).parts)) for folder in FOLDERS if folder != TOP}
+    assert {"fathom", *names} <= set(packages)
+
+
 def test_gtsam_is_imported_in_one_folder_only() -> None:
     having = {room_of(name) for name, path in MODULES.items() if any(parts[0] == "gtsam" for parts in imports(path))}
     assert having == {"estimators.graph"}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests" / "estimators").rglob("*.py")), ids=lambda path: path.name)
+def test_tests_of_estimators_do_without_the_harness(path: Path) -> None:
+    assert not [parts for parts in imports(path) if parts[:2] == ("fathom", "bench")]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("test_*.py")), ids=lambda path: path.name)
+def test_no_test_module_imports_another(path: Path) -> None:
+    assert not [parts for parts in imports(path) if parts[0].startswith("test_")]
 
 
 def test_the_walk_sees_relative_imports() -> None:

@@ -18,8 +18,9 @@ from fathom.datasets.formats.recording import Wanted
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import GpsSpec, ImuSpec
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from written import FUZZ
 from written_ardupilot import MESSAGES, definition, head, message, units, write_ardupilot
 
 FILE = "00000001.BIN"
@@ -250,9 +251,6 @@ def test_memory_is_that_of_what_is_wanted(tmp_path):
     grown, rows = map(int, ran.stdout.split())
     assert rows == 7000
     assert grown < 12e6 < size / 3
-
-
-FUZZ = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,9 @@ from fathom.datasets.described.opening import CATALOG, open_log
 from fathom.datasets.formats import columns as module
 from fathom.datasets.formats.columns import Table, read_table
 from fathom.datasets.times import times_ns
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from written import FUZZ
 
 START = 1_700_000_000
 PIECES = pytest.mark.parametrize(("rows", "size"), [(1, 1), (2, 7), (3, 100), (1000, 1 << 18)])
@@ -375,9 +376,6 @@ def test_comma2k19s_reference_is_consistent_in_its_own_frame(comma):
 
 # -- damage
 
-FUZZ = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
 JUNK = st.one_of(st.binary(max_size=8), st.text('0123456789,;.-e\n\r\t infa"%#', max_size=12).map(str.encode))
 TEXT = b"% remark\nt ,x,y\n" + b"".join(b"%d.%03d, %d.5,-1e3,\r\n" % (START + i, i, i) for i in range(12))
 
