@@ -293,10 +293,10 @@ def _undescribed(path: Path) -> Recording | None:
 
 
 class Output(StrEnum):
-    """Which of what an estimator says is scored."""
+    """Which trajectory of an estimator is scored."""
 
     online = "online"
-    hindsight = "hindsight"
+    smoothed = "smoothed"
 
 
 @app.command()
@@ -314,7 +314,7 @@ def tune(
     score: Annotated[str, typer.Option(help="What to make smaller, or more honest; as in `fathom list scores`.")] = (
         "ate_rmse_m"
     ),
-    output: Annotated[Output, typer.Option(help="Of what was said at once, or with hindsight.")] = Output.online,
+    output: Annotated[Output, typer.Option(help="Score the online or the smoothed trajectory.")] = Output.online,
     span: Annotated[float, typer.Option(min=1.01, help="Factors are searched from 1/SPAN to SPAN.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Of the search.")] = 0,
     data: Data = None,

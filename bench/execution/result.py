@@ -57,8 +57,8 @@ class Result:
 
     @property
     def outputs(self) -> dict[str, Trajectory]:
-        """The trajectories there are: "online", "hindsight"."""
-        every = {"online": self.online, "hindsight": self.smoothed}
+        """The trajectories there are: "online", "smoothed"."""
+        every = {"online": self.online, "smoothed": self.smoothed}
         return {name: trajectory for name, trajectory in every.items() if trajectory is not None}
 
 

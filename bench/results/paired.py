@@ -239,7 +239,7 @@ def paired(rows: pd.DataFrame, comparisons: Sequence[Comparison], scores: Sequen
     seeds = {key: {row["seed"] for row in of} for key, of in groups(every, "log", "label").items()}
     found: list[Record] = []
     for log, label, *baseline in comparisons:
-        for output in ("online", "hindsight"):
+        for output in ("online", "smoothed"):
             own = outputs.get((log, label, output))
             against = next((o for o in (output, "online") if (*baseline, o) in outputs), None)
             if own is None or against is None:

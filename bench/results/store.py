@@ -23,7 +23,7 @@ from .machine import machine
 Row = Mapping[str, Any]
 
 NAMES = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER", "output": "TEXT"}
-"""What a row is called: seed is NULL for a recorded log; output is "online" or "hindsight"."""
+"""What a row is called: seed is NULL for a recorded log; output is "online" or "smoothed"."""
 
 OUTCOME = {
     "status": "TEXT",  # done, diverged, failed, absent

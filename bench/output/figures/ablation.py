@@ -62,7 +62,7 @@ def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: 
     over = f", {max(seeds)} seeds, 95 % intervals" if seeds else ""
     title_above(figure, f"{title}: what each variant changes{over}")
     handles = [Patch(facecolor="#555555", edgecolor="#555555", label="at once")]
-    if any(row["output"] == "hindsight" for row in differences):
+    if any(row["output"] == "smoothed" for row in differences):
         handles.append(Patch(facecolor="white", edgecolor="#555555", label="with hindsight"))
     if seeds:
         handles.append(Patch(facecolor="none", label="in brackets: p (Holm) of 0.05 or more"))

@@ -75,7 +75,7 @@ def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fig
     handles = [
         look_handle(label, looks[label]) for label in dict.fromkeys(label for (label, _), of in lines.items() if of)
     ]
-    if any(output == "hindsight" for (_, output), of_line in lines.items() if of_line):
+    if any(output == "smoothed" for (_, output), of_line in lines.items() if of_line):
         dotted = {"marker": "o", "markersize": 3.5, "markerfacecolor": "white", "linestyle": ":", "linewidth": 0.8}
         handles.append(Line2D([], [], color="black", label="with hindsight", **dotted))
     handles.append(Line2D([], [], color="black", alpha=0.25, linewidth=6, label="95 % of honest points"))

@@ -43,7 +43,7 @@ def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
         axes.margins(0.12)
         logarithmic(axes, "xy")
     handles = [handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(summary, "label")]
-    if any(row["output"] == "hindsight" for row in summary):
+    if any(row["output"] == "smoothed" for row in summary):
         handles.append(handle("with hindsight", "o", "black", False))
     legend_below(figure, handles)
     return figure

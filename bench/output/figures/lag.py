@@ -21,7 +21,7 @@ FEWEST_LAGS = 3
 def lag_curve(summary: Sequence[Record]) -> str | None:
     """Return the estimator that one log's records hold at three lags or more; None where there is none."""
     for (name,), of_name in groups(summary, "estimator").items():
-        lags = [row["lookahead_s"] for row in of_name if row["output"] == "hindsight"]
+        lags = [row["lookahead_s"] for row in of_name if row["output"] == "smoothed"]
         if len(lags) == len(set(lags)) >= FEWEST_LAGS:  # two variants at one lag are no curve
             return name
     return None
@@ -35,7 +35,7 @@ def draw_lag_curve(summary: Sequence[Record], looks: dict[str, Look], title: str
     is known.
     """
     curve = lag_curve(summary)
-    ahead = {row["label"]: row["lookahead_s"] for row in summary if row["output"] == "hindsight"}
+    ahead = {row["label"]: row["lookahead_s"] for row in summary if row["output"] == "smoothed"}
     ticks = sorted({*ahead.values(), 0.0})
     figure, panels = empty_figure(2, 2, WIDTH_IN, 4.8)
     curve_last = sorted(summary, key=lambda row: row["estimator"] == curve)  # with other sensors, another floor

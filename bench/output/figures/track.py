@@ -118,7 +118,7 @@ def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
     title_above(figure, f"{title}: tracks{_aligned(tracks)}")
     drawn = dict.fromkeys(track.label for track in tracks)
     handles += [look_handle(label, looks[label]) for label in drawn]
-    if any(track.output == "hindsight" for track in tracks):
+    if any(track.output == "smoothed" for track in tracks):
         open_marker = {"marker": "o", "markersize": 3.5, "markerfacecolor": "white", "markeredgewidth": 0.5}
         handles.append(Line2D([], [], color="black", linewidth=0.5, label="with hindsight", **open_marker))
     legend_below(figure, handles, most=3)
@@ -150,7 +150,7 @@ def draw_errors(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
     for axes in grid[-1]:
         axes.set_xlabel("time (s)")
     title_above(figure, f"{title}: errors{_aligned(tracks)}")
-    hindsight = [track for track in tracks if track.output == "hindsight"]
+    hindsight = [track for track in tracks if track.output == "smoothed"]
     handles = [Line2D([], [], color="black", linewidth=1.0, label="online")]
     if any(_has_bounds(track) for track in tracks if track.output == "online"):
         handles.append(Line2D([], [], color="black", alpha=0.2, linewidth=6, label="±3σ, online"))

@@ -99,7 +99,7 @@ def seen(output: str, lookahead_s: float | None) -> str:
     if lookahead_s is None:
         return "nothing was said"
     ahead = "all of the log" if math.isinf(lookahead_s) else f"{lookahead_s:g} s ahead"
-    return f"sees {ahead}: {'at once' if output == 'online' else 'with hindsight'}"
+    return f"sees {ahead}: {output}"
 
 
 def number(name: str, row: Record) -> Cell:

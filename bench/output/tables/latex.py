@@ -48,7 +48,7 @@ COLUMNS = (
     Column("real_time_factor", ("× real", "time"), best=max),
 )
 COSTS = ("step_median_us", "step_p99_us", "real_time_factor")
-BLOCKS = {"online": "At once", "hindsight": "With hindsight"}
+BLOCKS = {"online": "Online", "smoothed": "Smoothed"}
 
 
 def write_latex(rows: pd.DataFrame, path: Path) -> None:

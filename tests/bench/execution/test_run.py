@@ -259,7 +259,7 @@ def test_hindsight_comes_beside_what_was_said_at_the_time(log: Log) -> None:
     assert log.truth is not None
     better = replace(log.truth.select(slice(100, None, 100)), lookahead_s=7.0)
     result = run_log(log, Fake(truthful(log, (1.0, 0.0, 0.0)), hindsight=lambda: better))
-    assert [(name, t.lookahead_s) for name, t in result.outputs.items()] == [("online", 0.0), ("hindsight", 7.0)]
+    assert [(name, t.lookahead_s) for name, t in result.outputs.items()] == [("online", 0.0), ("smoothed", 7.0)]
     assert [scores(log, t)["ate_rmse_m"] for t in result.outputs.values()] == pytest.approx([1.0, 0.0])
 
 

@@ -216,7 +216,7 @@ def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame
     assert wrong["anees_velocity_above"] >= 5
     assert wrong["nis_dvl"] > 5 > 1.2 > honest["nis_dvl"] > 0.8
     assert honest["nis_gps"] is None  # it comes late
-    assert summary["rts", "hindsight"]["nis_dvl"] is None
+    assert summary["rts", "smoothed"]["nis_dvl"] is None
     text = printed(rows, tmp_path, 120)
     lines = text[text.index("honesty") :].splitlines()
     of = {label: next(line for line in lines if line.startswith(label)) for label in JUDGED}
@@ -304,7 +304,7 @@ def test_what_became_of_late_readings_and_outliers_is_said(judged: tuple[pd.Data
 def test_a_covariance_that_is_none_is_named(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     text = printed(rows.assign(n_not_positive=2.0), tmp_path, 120)
-    assert "lawnmower-tactical / rts hindsight: 10 covariances are not positive definite" in text
+    assert "lawnmower-tactical / rts smoothed: 10 covariances are not positive definite" in text
     assert "not positive" not in printed(rows, tmp_path, 120)
 
 

@@ -17,7 +17,7 @@ from fathom.bench.results.store import COLUMNS as STORED
 from hypothesis import given
 from hypothesis import strategies as st
 
-OUTPUTS = {"dr": ["online"], "eskf": ["online"], "fls": ["online", "hindsight"], "rts": ["online", "hindsight"]}
+OUTPUTS = {"dr": ["online"], "eskf": ["online"], "fls": ["online", "smoothed"], "rts": ["online", "smoothed"]}
 LOOKAHEAD_S = {"online": 0.0, "fls": 3.0, "rts": np.inf}
 
 
@@ -81,7 +81,7 @@ def test_every_number_and_interval_is_that_of_the_csv(tmp_path: Path) -> None:
     write_table(rows, tmp_path / "table.csv")
     csv = pd.read_csv(tmp_path / "table.csv").set_index(["output", "label"])
     found = blocks((tmp_path / "table.tex").read_text())
-    names = {"At once": "online", "With hindsight": "hindsight"}
+    names = {"Online": "online", "Smoothed": "smoothed"}
     assert {(names[block], label) for block, of in found.items() for label in of} == set(csv.index)
     ends = 0
     for block, of_block in found.items():
@@ -124,12 +124,12 @@ def test_what_did_not_end_every_run_is_said_and_not_ranked() -> None:
     rows.loc[rows["label"] == "eskf", "ate_rmse_m"] = 1e-3
     rows.loc[(rows["label"] == "fls") & rows["seed"].isin([1, 2]), "status"] = "failed"
     found = blocks(latex(rows))
-    assert found["At once"]["eskf"][1] == "5/6, 1 diverged"
-    assert found["With hindsight"]["fls"][1] == "4/6, 2 failed"
-    assert parse(found["At once"]["eskf"][2])["value"] == 0.001
-    assert not any(parse(cell)["bold"] for label in ("eskf", "fls") for cell in found["At once"][label][2:])
-    assert any(parse(found["At once"][label][2])["bold"] for label in ("dr", "rts"))
-    assert not any(parse(cell)["bold"] for of in found["With hindsight"].values() for cell in of[2:])  # one is no race
+    assert found["Online"]["eskf"][1] == "5/6, 1 diverged"
+    assert found["Smoothed"]["fls"][1] == "4/6, 2 failed"
+    assert parse(found["Online"]["eskf"][2])["value"] == 0.001
+    assert not any(parse(cell)["bold"] for label in ("eskf", "fls") for cell in found["Online"][label][2:])
+    assert any(parse(found["Online"][label][2])["bold"] for label in ("dr", "rts"))
+    assert not any(parse(cell)["bold"] for of in found["Smoothed"].values() for cell in of[2:])  # one is no race
 
 
 def test_the_caption_states_seeds_alignment_dimensions_and_step() -> None:
@@ -156,7 +156,7 @@ def test_costs_of_runs_with_nis_are_not_ranked() -> None:
 def test_where_nothing_was_run_there_is_no_table() -> None:
     assert r"\begin" not in latex(table(status="absent"))
     failed = latex(table(status="failed", truth_kind=None, lookahead_s=None))
-    assert blocks(failed)["At once"]["eskf"] == ["--", "0/6, 6 failed", *["--"] * len(COLUMNS)]
+    assert blocks(failed)["Online"]["eskf"] == ["--", "0/6, 6 failed", *["--"] * len(COLUMNS)]
 
 
 def test_logs_have_labels_of_their_own() -> None:

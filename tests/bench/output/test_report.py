@@ -178,7 +178,7 @@ def test_the_first_table_says_what_table_csv_and_the_terminal_say(rows: pd.DataF
     sheet = page.locator("#accuracy ~ .sheet table").first
     told = sheet.evaluate(
         """table => [...table.tBodies].flatMap((body) => [...body.rows].slice(1).map((row) => [row.cells[0].innerText,
-        body.rows[0].innerText.includes("hindsight") ? "hindsight" : "online",
+        body.rows[0].innerText.includes("smoothed") ? "smoothed" : "online",
         [...row.cells].slice(2).map((cell) => [cell.dataset.value ?? null, cell.innerText])]))"""
     )
     assert {(label, output) for label, output, _ in told} == set(csv.index)
@@ -215,7 +215,7 @@ def test_a_header_sorts_numbers_by_size_both_ways_each_lookahead_by_itself(page:
         absent = [None] * (len(was) - len(numbers))
         assert risen == [*map(str, sorted(numbers)), *absent]
         assert fallen == [*map(str, sorted(numbers, reverse=True)), *absent]
-    assert len(before) == 3  # at once, with hindsight, and who said nothing
+    assert len(before) == 3  # online, smoothed, and who said nothing
 
 
 def test_sorting_is_stable_knows_numbers_in_words_and_leaves_the_absent_last(
@@ -283,7 +283,7 @@ def test_a_figure_holds_what_the_trajectories_say(rows: pd.DataFrame, folder: Pa
 def test_a_run_opens_to_its_spec_and_travels_with_it_when_sorted(rows: pd.DataFrame, page: Any) -> None:
     run = rows[(rows["label"] == "rts") & (rows["seed"] == 2) & (rows["output"] == "online")].iloc[0]
     place = list(rows["identity"] + rows["output"]).index(run["identity"] + "online")
-    page.locator("#filter").fill(f"{run['identity'][:8]} at once")
+    page.locator("#filter").fill(f"{run['identity'][:8]} online")
     assert page.locator("#filtered").inner_text() == f"1 of {len(rows)}"
     button = page.locator(f"tr[data-run='{place}'] .opens")
     button.focus()

@@ -266,8 +266,8 @@ def test_an_output_is_compared_with_its_like_or_with_what_was_said_at_once() -> 
     for s in range(6):
         for label, outputs in (
             ("filter", ("online",)),
-            ("f1", ("online", "hindsight")),
-            ("f2", ("online", "hindsight")),
+            ("f1", ("online", "smoothed")),
+            ("f2", ("online", "smoothed")),
         ):
             for output in outputs:
                 seen = 0.0 if output == "online" else 3.0
@@ -281,9 +281,9 @@ def test_an_output_is_compared_with_its_like_or_with_what_was_said_at_once() -> 
     keys = ("label", "output", "baseline_label", "baseline_output", "baseline_lookahead_s")
     assert [tuple(row[key] for key in keys) for row in found] == [
         ("f2", "online", "f1", "online", 0),
-        ("f2", "hindsight", "f1", "hindsight", 3),
+        ("f2", "smoothed", "f1", "smoothed", 3),
         ("f2", "online", "filter", "online", 0),
-        ("f2", "hindsight", "filter", "online", 0),
+        ("f2", "smoothed", "filter", "online", 0),
         ("filter", "online", "f1", "online", 0),
     ]
 

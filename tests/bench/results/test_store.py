@@ -34,7 +34,7 @@ def test_rows_come_back_with_absent_numbers_absent(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", [1, None])
 def test_a_run_replaces_all_rows_of_its_predecessor_and_no_others(tmp_path: Path, seed: int | None) -> None:
     with Store(tmp_path / "runs.sqlite") as store:
-        store.write([row(seed=seed), row(seed=seed, output="hindsight")])
+        store.write([row(seed=seed), row(seed=seed, output="smoothed")])
         store.write([row(seed=7)])
         store.write([row(seed=seed, status="failed", ate_rmse_m=None)])
         table = store.read()
@@ -46,14 +46,14 @@ def test_a_run_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with Store(tmp_path / "runs.sqlite") as store:
         store.write([row()])
         with pytest.raises(ExperimentError, match="cannot write"):
-            store.write([row(ate_rmse_m=9.0), row(output="hindsight", no_such_column=1)])
+            store.write([row(ate_rmse_m=9.0), row(output="smoothed", no_such_column=1)])
         assert store.read()["ate_rmse_m"].tolist() == [1.5]
 
 
 def test_a_run_that_cannot_be_made_keeps_what_an_earlier_one_left(tmp_path: Path) -> None:
     absent = {"status": "absent", "ate_rmse_m": None}
     with Store(tmp_path / "runs.sqlite") as store:
-        store.write([row(seed=None), row(seed=None, output="hindsight")])
+        store.write([row(seed=None), row(seed=None, output="smoothed")])
         assert not store.write_absent(row(seed=None, **absent))
         assert store.write_absent(row(label="new", **absent))
         assert store.write_absent(row(label="new", **absent))
