@@ -8,9 +8,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
-from fathom.bench.execution.result import Result
-from fathom.bench.metrics import ate
+from driver import Driven, rmse_m, run_log
 from fathom.datasets import Belief, Log, Trajectory
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
 from fathom.datasets.simulated.scenario import Scenario
@@ -109,7 +107,7 @@ def _gap_squared(a: Trajectory, b: Trajectory, after: int) -> np.ndarray:
 
 
 @cache
-def _plain() -> tuple[Log, Result]:
+def _plain() -> tuple[Log, Driven]:
     log = simulate(SURFACE, seed=4)
     return log, run_log(log, create("fls"))
 
@@ -145,9 +143,9 @@ def test_one_gps_reading_in_ten_fifty_metres_off_ruins_the_plain_smoother_only(l
     spoilt, n = _spoilt(log)
     assert n >= 10
     ruined, robust = run_log(spoilt, create("fls")), run_log(spoilt, create("fls", robust={"gps": loss}))
-    good_m = ate(log.truth, plain.smoothed).rmse_m
-    assert ate(log.truth, ruined.smoothed).rmse_m > good_m + 3.0
-    assert ate(log.truth, robust.smoothed).rmse_m < good_m + (1.0 if loss == "huber" else 0.3)
+    good_m = rmse_m(log.truth, plain.smoothed)
+    assert rmse_m(log.truth, ruined.smoothed) > good_m + 3.0
+    assert rmse_m(log.truth, robust.smoothed) < good_m + (1.0 if loss == "huber" else 0.3)
     low, high = binom.interval(0.999, len(log.gps) - n, 2 * norm.sf(WIDTHS[loss]))
     assert low <= robust.counts["outliers_gps"] - n <= high
 
@@ -157,7 +155,7 @@ def test_every_smoother_on_gtsam_takes_a_loss(name: str) -> None:
     log, plain = _plain()
     spoilt, n = _spoilt(log)
     result = run_log(spoilt, create(name, robust={"gps": "tukey"}))
-    assert ate(log.truth, result.online).rmse_m < ate(log.truth, plain.online).rmse_m + 0.3
+    assert rmse_m(log.truth, result.online) < rmse_m(log.truth, plain.online) + 0.3
     assert result.counts["outliers_gps"] == n
 
 
@@ -166,7 +164,7 @@ def test_an_outlier_between_keyframes_does_not_move_the_belief_either() -> None:
     log, _ = _plain()
     spoilt, _ = _spoilt(log)
     smoother = create("fls", keyframe_period_s=2.0, robust={"gps": "tukey"})
-    clean, robust = (run_log(x, smoother, score_period_s=0.2).online for x in (log, spoilt))
+    clean, robust = (run_log(x, smoother, period_s=0.2).online for x in (log, spoilt))
     assert np.abs(clean.p_WB_W - robust.p_WB_W).max() < 1.0
 
 
@@ -177,7 +175,7 @@ def test_a_gps_without_height_works_under_a_loss(loss: Loss) -> None:
     sigma[:, 2] = np.inf
     result = run_log(replace(log, gps=replace(log.gps, sigma=sigma)), create("fls", robust={"gps": loss}))
     assert result.status == "done", result.cause
-    assert ate(log.truth, result.online).rmse_m < ate(log.truth, plain.online).rmse_m + 0.3
+    assert rmse_m(log.truth, result.online) < rmse_m(log.truth, plain.online) + 0.3
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.5, 3.0])

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
+from driver import run_log
 from fathom.datasets import Trajectory
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
