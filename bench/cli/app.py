@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from ...datasets.formats.recording import Recording
     from ...datasets.simulated.scenario import Scenario
     from ...datasets.trajectory import Trajectory
@@ -92,16 +94,21 @@ def run(
     with refusing_bad_input():
         from ..execution.sweep import sweep
         from ..experiment.plan import Experiment
-        from ..output.present import present
+        from ..output.present import present, print_log
 
         plan = Experiment.load(experiment)
-        folder = out / plan.name
+        folder, printed = out / plan.name, []
+
+        def show(rows: pd.DataFrame) -> None:
+            print_log(rows, plan)
+            printed.append(rows["log"].iloc[0])
+
         try:
-            outcome = sweep(plan, data, out, jobs, only, repair, force, dask)
+            outcome = sweep(plan, data, out, jobs, only, repair, force, dask, show)
         except KeyboardInterrupt:
             _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}; the same command does the rest")
             raise typer.Exit(INTERRUPTED) from None
-        present(outcome, plan, folder)
+        present(outcome, plan, folder, printed)
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)
