@@ -57,7 +57,7 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     _write_report(every, plan, folder, differences)
     shown = set(zip(rows["log"], rows["label"], strict=True))
     print_table(
-        rows.loc[~rows["log"].isin(printed)],
+        rows.loc[~rows["log"].isin(list(printed))],
         differences=[row for row in differences if (row["log"], row["label"]) in shown],
     )
     if outcome.standing:

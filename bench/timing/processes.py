@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..execution.pool import THREAD_COUNTS
+from ..execution.child import THREAD_COUNTS
 from .revision import TimingError, Tree
 
 
