@@ -19,7 +19,7 @@ FOLDERS = sorted({path.parent for path in SOURCES})
 MOST_MODULES = 16
 """In one folder; more cannot be taken in at a glance."""
 MOST_FLOORS = 10
-FRONTS = {"estimators.registry"}
+FRONTS = {"estimators.registry", "bench.output.present"}
 """Modules that gather a folder and those below it, as `__init__` does: a floor of their own, above both."""
 
 

@@ -90,7 +90,7 @@ def run(
     What an earlier `fathom run` finished is not run again, unless its spec, its log, or the version has changed.
     """
     with refusing_bad_input():
-        from ..execution.sweep import run_experiment
+        from ..execution.sweep import Outcome, run_experiment
         from ..experiment.plan import Experiment
         from ..output.present import present
 
@@ -101,7 +101,7 @@ def run(
         except KeyboardInterrupt:
             _say(f"interrupted: the finished runs are kept in {folder / 'runs.sqlite'}; the same command does the rest")
             raise typer.Exit(INTERRUPTED) from None
-        present(rows, plan, folder)
+        present(Outcome(rows, **rows.attrs), plan, folder)
     statuses = set(rows.loc[~rows["log"].isin(rows.attrs["kept"]), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)

@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -22,6 +22,22 @@ from .cold_start import compile_first
 from .dask_pool import run_on_cluster
 from .pool import run_all
 from .task import Task
+
+
+class Outcome(NamedTuple):
+    """What a sweep left in the store.
+
+    Attributes:
+        rows: of the store, one per run and output.
+        standing: how many runs were in the store already.
+        renewed: how many stood there under another identity and were run anew.
+        kept: why a log did not run whose rows of an earlier day are kept.
+    """
+
+    rows: pd.DataFrame
+    standing: int
+    renewed: int
+    kept: dict[str, str]
 
 
 def run_experiment(
