@@ -147,10 +147,8 @@ class Trajectory:
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
 
-    def to_pandas(self) -> pd.DataFrame:
-        """Return one row per state: t_ns, R_WB_00.., p_WB_W_x.., and v, b_a, b_g and P_0_0.. if known."""
-        import pandas as pd
-
+    def to_columns(self) -> dict[str, Array | TimeArray]:
+        """Return arrays (n,): t_ns, R_WB_00.., p_WB_W_x..; where known v, b_a, b_g, and P_0_0.. (j ≥ i)."""
         columns: dict[str, Array | TimeArray] = {"t_ns": self.t_ns}
         for i in range(3):
             for j in range(3):
@@ -161,7 +159,13 @@ class Trajectory:
                 columns |= {f"{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
         if self.P is not None:
             columns |= {f"P_{i}_{j}": self.P[:, i, j] for i in range(15) for j in range(i, 15)}
-        return pd.DataFrame(columns)
+        return columns
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return one row per state, with the columns of `to_columns`."""
+        import pandas as pd
+
+        return pd.DataFrame(self.to_columns())
 
     @classmethod
     def from_pandas(cls, table: pd.DataFrame, lookahead_s: float = 0.0) -> Trajectory:

@@ -34,7 +34,7 @@ class Task:
         lags_s: those of all estimators of the experiment, whose floors are found together.
         data: where recorded logs are.
         repair: let loaders drop bad rows.
-        readings_sha256: of a recorded log, or of a simulated one's recorded path; see `ledger.identity`.
+        readings_sha256: of a recorded log, or of a simulated one's recorded path; see `identity.identity`.
     """
 
     experiment: str
@@ -132,12 +132,19 @@ def file_name(task: Task, output: str, content: str) -> str:
 
 def parquet(trajectory: Trajectory) -> bytes:
     """Return a trajectory as the content of a Parquet file; of the covariance, the 3 × 3 blocks."""
-    table = trajectory.to_pandas()
-    across = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15) if i // 3 != j // 3]
-    table = table.drop(columns=across, errors="ignore")
-    with np.errstate(over="ignore"):  # a covariance on its way to infinity may get there
-        table = table.astype({column: "float32" for column in table if column.startswith("P_")})
-    return table.to_parquet(index=False)
+    import pyarrow as pa
+    from pyarrow.parquet import write_table
+
+    columns = trajectory.to_columns()
+    for i in range(15):
+        for j in range(i, 15):
+            values = columns.pop(f"P_{i}_{j}", None)
+            if values is not None and i // 3 == j // 3:
+                with np.errstate(over="ignore"):  # a covariance on its way to infinity may get there
+                    columns[f"P_{i}_{j}"] = values.astype(np.float32)
+    buffer = pa.BufferOutputStream()
+    write_table(pa.table(columns), buffer, use_dictionary=False, write_statistics=False)
+    return buffer.getvalue().to_pybytes()
 
 
 def _file_part(text: str) -> str:

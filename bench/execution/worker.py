@@ -37,16 +37,16 @@ LOGS_KEPT = 2
 
 def work(connection: Connection) -> None:
     """Do tasks until there are no more, or nobody to tell."""
-    bench = Bench()
+    cache = WorkerCache()
     while True:
         try:
-            connection.send(bench.execute(connection.recv()))
+            connection.send(cache.execute(connection.recv()))
         except (EOFError, OSError):
             return
 
 
-class Bench:
-    """What a worker keeps from one task to the next: the last logs with what is made of them, what is compiled."""
+class WorkerCache:
+    """What a worker keeps from one task to the next: the last logs, their floors and truths, and what is compiled."""
 
     def __init__(self) -> None:
         self.logs: OrderedDict[str, Log] = OrderedDict()
@@ -55,7 +55,7 @@ class Bench:
         self.warm: set[str] = set()
 
     def execute(self, task: Task) -> Finished:
-        """Do one run and return what it leaves, whatever happens."""
+        """Do one run and return its rows and trajectories; an error becomes a row."""
         started = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             log = self.open(task)
@@ -94,6 +94,8 @@ class Bench:
         if repr(estimator) not in self.warm:
             warm_up(estimator)
             self.warm.add(repr(estimator))
+            gc.collect()
+            gc.freeze()  # what imports and compiling made stays: no later collection walks through it again
         return estimator
 
     def floor(self, task: Task, result: Result, lookahead_s: float) -> dict[str, float | None]:

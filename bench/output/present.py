@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from ..errors import ExperimentError
-from ..execution.sweep import outdated, rows_of
+from ..execution.sweep import Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
 from ..results.paired import paired
 from ..results.store import load_runs
@@ -24,8 +24,9 @@ from .tables.table import print_table, write_consistency, write_paired, write_ta
 say = partial(typer.echo, err=True)
 
 
-def present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
+def present(outcome: Outcome, plan: Experiment, folder: Path) -> None:
     """Write the CSV files and the figures of all that was run of this plan, and print the tables of these rows."""
+    rows = outcome.rows
     every = rows_of(load_runs(folder), plan.runs())
     others = every.loc[~every["identity"].isin(rows["identity"])]
     old = others.index[outdated(others, plan)]
@@ -43,14 +44,13 @@ def present(rows: pd.DataFrame, plan: Experiment, folder: Path) -> None:
     _write_report(every, plan, folder, differences)
     shown = set(zip(rows["log"], rows["label"], strict=True))
     print_table(rows, differences=[row for row in differences if (row["log"], row["label"]) in shown])
-    standing, renewed = rows.attrs["standing"], rows.attrs["renewed"]
-    if standing:
-        say(f"{standing} runs were done already; --force does them again")
-    if renewed:
-        say(f"{renewed} runs were done under another spec, log or version, and made anew")
+    if outcome.standing:
+        say(f"{outcome.standing} runs were done already; --force does them again")
+    if outcome.renewed:
+        say(f"{outcome.renewed} runs were done under another spec, log or version, and made anew")
     if len(old):
         say(f"{len(old)} rows of another spec or version are left out of the files; without --only they are renewed")
-    for log, cause in rows.attrs["kept"].items():
+    for log, cause in outcome.kept.items():
         say(f"{log}: {cause}; its rows are from an earlier run")
 
 

@@ -24,13 +24,13 @@ from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, PriorSpec
 from fathom.estimators import ESTIMATORS, FACTORS, create
-from fathom.estimators.filters.eskf import propagate
 from fathom.estimators.filters.iekf import from_invariant, propagate_invariant, to_invariant
 from fathom.estimators.graph.gtsam_border import insert_state, preintegrate_imu
 from fathom.estimators.physics.dvl_preintegration import preintegrate_dvl
-from fathom.estimators.physics.imu import BLOCK, STATE, compile_rig, first_sample, integrate, over_world, predict
-from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict
+from fathom.estimators.physics.kalman import propagate
 from fathom.estimators.physics.so3 import exp, skew
+from fathom.estimators.physics.state import STATE, as_belief, as_record
 from gtsam.symbol_shorthand import B, V, X
 from paths import GRAVITY, Path, random_rig, random_rotation, reading
 from scipy.spatial.transform import Rotation

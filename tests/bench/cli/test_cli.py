@@ -211,6 +211,31 @@ def test_help_imports_nothing_heavy() -> None:
         assert command in shown.stdout
 
 
+def test_the_list_of_verbs_says_of_each_in_whole_sentences_what_it_does() -> None:
+    for arguments in ((), ("timing",)):
+        shown = call(*arguments, "--help")[1].partition("Commands:")[2]
+        assert "..." not in shown
+        assert shown.count(".\n") >= 5
+
+
+@pytest.mark.parametrize("verb", ["run", "simulate", "inspect"])
+def test_ctrl_c_is_one_line_and_status_130(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fathom.bench.execution.sweep.sweep", interrupted)
+    monkeypatch.setattr("fathom.datasets.simulated.simulator.simulate", interrupted)
+    monkeypatch.setattr("fathom.bench.inspection.inspecting.open_to_inspect", interrupted)
+    arguments = {
+        "run": [write(tmp_path)],
+        "simulate": ["yo-yo", "-o", tmp_path / "x"],
+        "inspect": ["ictineu_stpere_2004"],
+    }
+    code, _, err = call(verb, *arguments[verb])
+    assert code == 130
+    assert err.splitlines()[-1].startswith("interrupted")
+
+
 def test_ctrl_c_keeps_the_finished_runs_and_exits_130(tmp_path: Path) -> None:
     labels = ", ".join(f"{{name: dead-reckoning, label: n{k}}}" for k in range(200))
     file = write(tmp_path, estimators=f"[{labels}]", logs="[{scenario: {duration_s: 300}}]")

@@ -27,9 +27,9 @@ from fathom.bench.errors import ExperimentError
 from fathom.bench.execution import dask_pool as cluster
 from fathom.bench.execution import dask_worker as remote
 from fathom.bench.execution.pool import Queue, log_of
-from fathom.bench.execution.sweep import run_experiment
+from fathom.bench.execution.sweep import run_experiment, sweep
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.scoring import SCORES
 from fathom.bench.results import identity as ledger
@@ -189,7 +189,7 @@ def test_a_worker_that_is_killed_costs_a_retry_and_the_rows_are_those_of_a_local
     for name in {*rows["trajectory"], *rows["truth_trajectory"]}:
         tables = [pd.read_parquet(tmp_path / where / "t" / "trajectories" / name) for where in ("cluster", "local")]
         pd.testing.assert_frame_equal(*tables, check_exact=True)
-    assert run_experiment(plan, out=tmp_path / "cluster", jobs=1).attrs["standing"] == 8  # one ledger for both
+    assert sweep(plan, out=tmp_path / "cluster", jobs=1).standing == 8  # one ledger for both
 
 
 @pytest.mark.slow
@@ -330,7 +330,7 @@ def test_a_log_that_differs_from_the_one_planned_is_refused_and_one_that_does_no
     log = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
     folder = write_folder(log, tmp_path / "dive", "csv")
     plan = experiment(logs=[{"log": str(folder)}], estimators=[{"name": "dead-reckoning", "label": k} for k in "ab"])
-    bench = Bench()
+    bench = WorkerCache()
     first, second = (Task.of(plan, run) for run in plan.runs())
     right = content_sha256(plan.logs[0].open(None))
     assert bench.execute(replace(first, readings_sha256=right)).rows[0]["status"] == "done"

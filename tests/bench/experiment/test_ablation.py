@@ -11,7 +11,7 @@ import pytest
 from fathom.bench.cli.app import app
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.comparison import Comparison
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.experiment.variants import changed, named_axes, points
@@ -295,7 +295,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
     (out / "small.yaml").write_text(str(PLAN).replace("'", '"'))  # JSON is YAML
     with pytest.MonkeyPatch.context() as patch:
-        bench = Bench()
+        bench = WorkerCache()
         patch.setattr(
             "fathom.bench.execution.sweep.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks)
         )
@@ -367,7 +367,7 @@ def test_the_figure_is_vectors_and_a_legible_png(differences: list[dict[str, Any
 
 
 def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench()
+    bench = WorkerCache()
     monkeypatch.setattr(
         "fathom.bench.execution.sweep.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks)
     )

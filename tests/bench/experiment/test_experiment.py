@@ -346,7 +346,7 @@ def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.Monke
         def send(self, rows: object) -> None:
             raise BrokenPipeError
 
-    monkeypatch.setattr("fathom.bench.execution.worker.Bench.execute", lambda bench, task: [])
+    monkeypatch.setattr("fathom.bench.execution.worker.WorkerCache.execute", lambda bench, task: [])
     work(Gone())
 
 

@@ -13,7 +13,7 @@ from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DvlSpec, GpsSpec, HeadingSpec
 from fathom.estimators import Diverged, create
-from fathom.estimators.physics.measurements import decorrelate
+from fathom.estimators.physics.elimination import decorrelate
 from logs import until
 from paths import NOISE, reading
 

@@ -17,9 +17,9 @@ from fathom.estimators.filters.iekf import (
     to_invariant,
 )
 from fathom.estimators.interface import FACTORS
-from fathom.estimators.physics.imu import BLOCK, STATE, integrate, predict
+from fathom.estimators.physics.imu import BLOCK, integrate, predict
 from fathom.estimators.physics.imu import compile_rig as compiled
-from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.physics.state import STATE, as_belief, as_record
 from linear import LINEAR, TOY_RIG, linear_toy
 from logs import DELAYED, until
 from paths import GRAVITY, Path, random_rig, random_state
@@ -130,7 +130,7 @@ def test_invariant_covariance_is_ours_in_other_coordinates_after_a_block() -> No
     M = rng.normal(size=(15, 15)) * np.repeat([0.1, 1.0, 0.1, 1e-2, 1e-3], 3)[:, None]
     x, origin = path.state(0.0, np.zeros(3), np.zeros(3)), rng.normal(size=3)
     prior = Belief(0, x, M @ M.T)
-    from fathom.estimators.filters.eskf import propagate
+    from fathom.estimators.physics.kalman import propagate
 
     records, block = compiled(rig, FACTORS, {}), np.zeros(1, BLOCK)
     ours, theirs = as_record(prior), as_record(prior)

@@ -12,9 +12,9 @@ from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec
 from fathom.estimators import create
 from fathom.estimators.filters import rts
-from fathom.estimators.filters.rts import PAGE, STANDSTILL, divide, smooth_one
-from fathom.estimators.physics.imu import STATE
-from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.filters.rts import PAGE, STANDSTILL, smooth_one
+from fathom.estimators.physics.elimination import divide_into
+from fathom.estimators.physics.state import STATE, as_belief, as_record
 from linear import LINEAR, TOY_RIG, least_squares, linear_toy
 from logs import DELAYED, until
 from paths import random_state
@@ -116,10 +116,12 @@ def test_over_no_time_hindsight_is_handed_on_as_it_is(seed: int) -> None:
 
 def test_what_has_no_variance_is_left_out_of_the_gain() -> None:
     rng = np.random.default_rng(0)
-    M, A = rng.normal(size=(5, 5)) * np.array([1, 1e-3, 1e3, 1, 1])[:, None], rng.normal(size=(6, 6))
-    P, G = np.zeros((6, 6)), np.empty((6, 6))
-    P[:5, :5] = M @ M.T
-    assert divide(P, A, G)
-    assert np.allclose(G[:, :5] @ P[:5, :5], A[:5].T, rtol=1e-8, atol=1e-8)
-    assert (G[:, 5] == 0).all()
-    assert not divide(P - 1e-3 * np.eye(6), A, G)
+    known = np.r_[0:4, 5:15]
+    scale = np.resize([1, 1e-3, 1e3, 1, 1], len(known))
+    M, A = rng.normal(size=(len(known), 40)) * scale[:, None], rng.normal(size=(15, 15))
+    P, X = np.zeros((15, 15)), np.empty((15, 15))
+    P[np.ix_(known, known)] = M @ M.T
+    assert divide_into(P, A, X)
+    assert np.allclose(P[np.ix_(known, known)] @ X[known], A[known], rtol=1e-8, atol=1e-8)
+    assert (X[4] == 0).all()
+    assert not divide_into(P - 1e-3 * np.eye(15), A, X)

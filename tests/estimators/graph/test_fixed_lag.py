@@ -26,7 +26,7 @@ from fathom.estimators.graph.gtsam_border import (
 )
 from fathom.estimators.physics.dvl_preintegration import preintegrate_dvl
 from fathom.estimators.physics.imu import BLOCK, compile_rig, integrate
-from fathom.estimators.physics.records import as_record
+from fathom.estimators.physics.state import as_record
 from gtsam.symbol_shorthand import B, V, X
 from logs import until
 from paths import Path, random_rig, random_rotation, random_state, reading, residual

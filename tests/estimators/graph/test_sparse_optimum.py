@@ -16,7 +16,7 @@ from fathom.estimators import create
 from fathom.estimators.filters.eskf_filterpy import stack
 from fathom.estimators.interface import FACTORS
 from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise
-from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.physics.state import as_belief, as_record
 
 SMALL = {"depth_m": 5.0, "shallow_m": 1.0, "leg_m": 15.0, "turn_radius_m": 5.0, "surface_for_s": 20.0}
 """A minute of it holds two stays at the surface, and legs and turns, or dives and climbs, between them."""

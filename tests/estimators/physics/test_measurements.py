@@ -12,7 +12,7 @@ from fathom.datasets.state import Belief
 from fathom.estimators import FACTORS
 from fathom.estimators.physics.imu import compile_rig
 from fathom.estimators.physics.measurements import measure, preintegrated_dvl_residual
-from fathom.estimators.physics.records import as_record
+from fathom.estimators.physics.state import as_record
 from paths import NOISE, Path, random_rig, random_rotation, random_state, reading, residual
 from scipy.spatial.transform import Rotation
 

@@ -16,18 +16,18 @@ from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, Heading
 from fathom.datasets.state import DIM
 from fathom.estimators import FACTORS, Diverged, create
 from fathom.estimators.graph import solvers
+from fathom.estimators.graph.losses import m_estimator
 from fathom.estimators.physics.dvl_preintegration import DISPLACEMENT, given_rotation, preintegrate_dvl
-from fathom.estimators.physics.imu import BLOCK, STATE, compile_rig, integrate, predict, process_noise
-from fathom.estimators.physics.records import as_belief, as_record
-from fathom.estimators.robust import m_estimator, width
+from fathom.estimators.physics.elimination import absorb_row, divide_into
+from fathom.estimators.physics.imu import BLOCK, compile_rig, integrate, predict, process_noise
+from fathom.estimators.physics.state import STATE, as_belief, as_record
+from fathom.estimators.robust import width
 from fathom.estimators.window.chain import (
     NODE,
     absorb_joint_row,
-    absorb_row,
     back_substitute,
     covariance_with_hindsight,
     cross_tie,
-    divide_into,
 )
 from fathom.estimators.window.factors import (
     AT_KEYFRAME,

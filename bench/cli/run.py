@@ -1,0 +1,52 @@
+"""`fathom run`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .options import Data, ExperimentName, Jobs, Repair, Results
+from .verb import BAD_INPUT, SOME_FAILED, on_interrupt
+
+
+def run(
+    experiment: ExperimentName,
+    data: Data = None,
+    out: Results = Path("results"),
+    jobs: Jobs = 0,
+    only: Annotated[
+        str | None,
+        typer.Option(metavar="GLOB", help='Run only what matches: a label, a log\'s name, or "log/label".'),
+    ] = None,
+    repair: Repair = False,
+    force: Annotated[bool, typer.Option("--force", help="Repeat runs that are already finished.")] = False,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help='Run on a Dask cluster: tcp://host:port, its scheduler file (.json), or "local" (starts a cluster of '
+            "--jobs processes here).",
+        ),
+    ] = None,
+) -> None:
+    """Run an experiment and print its tables.
+
+    Every estimator of EXPERIMENT runs on each of its logs. Finished runs are kept. They are repeated only if their
+    spec, their log or a version has changed.
+    """
+    from ..execution.sweep import sweep
+    from ..experiment.plan import Experiment
+    from ..output.present import present
+
+    plan = Experiment.load(experiment)
+    folder = out / plan.name
+    with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
+        outcome = sweep(plan, data, out, jobs, only, repair, force, dask)
+    present(outcome, plan, folder)
+    statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
+    if statuses <= {"absent"}:  # nothing was run
+        raise typer.Exit(BAD_INPUT)
+    if statuses - {"done", "absent"}:
+        raise typer.Exit(SOME_FAILED)
