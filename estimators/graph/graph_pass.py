@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import DVL, IMU_SAMPLE, SENSOR, Epoch
 from ...datasets.rig import Rig
-from ...datasets.state import DIM, Array, Belief, NavState
+from ...datasets.state import DIM, Belief, NavState
 from ...datasets.trajectory import Trajectory
 from ..interface import Diverged
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, SOLVE, SUMMED, Keyframes
