@@ -175,6 +175,7 @@ print((after - before) * (1 if sys.platform == "darwin" else 1024), len(t_ns), i
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_memory_is_that_of_the_wanted_columns(tmp_path, suffix):
     """A table of 110 MB and 20 columns, of which 3 are wanted: 300,000 rows, 7 MB."""

@@ -347,6 +347,7 @@ def test_contents_lists_the_topics(small, ros1):
     assert {"header.stamp", "orientation.w", "linear_acceleration_covariance.0"} <= set(imu.fields)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2])
 def test_what_is_not_wanted_costs_no_memory(tmp_path, version):
     """160 MB of images around 8 MB of IMU samples; 3 columns of them are wanted."""
