@@ -1,36 +1,131 @@
-"""The one exception of this package that a caller might catch."""
+"""`DatasetError`, the one exception of this package that a caller might catch, and the wording of its messages."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
 
 
 class DatasetError(ValueError):
-    """A log, a description of one, or a trajectory file cannot be used; says what, where and what to do."""
+    """A log, a description or a trajectory file cannot be used; the message says what, where and what to do."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'x'?" for the known name closest to `name`, or or ""; case does not count."""
+    """Return "; did you mean 'x'?" for the known name closest to `name`, or "" if none is close; ignores case."""
     folded = {other.casefold(): other for other in known}
     close = difflib.get_close_matches(name.casefold(), folded, n=1)
     return f"; did you mean {folded[close[0]]!r}?" if close else ""
 
 
 def nearest_file(path: Path, *, folders: bool = False) -> str:
-    """Return what `nearest` says of a file that is not there, of the files (and folders) beside it."""
+    """Return `nearest` for a missing file, among the files (and folders) next to it."""
     beside = path.parent.iterdir() if path.parent.is_dir() else []
     return nearest(path.name, [other.name for other in beside if folders or other.is_file()])
 
 
 def one_line(error: Exception) -> str:
-    """Return the kind of an error and what it says, in one line."""
+    """Return the class and the message of an error, on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def not_loaded(point: EntryPoint, error: Exception) -> str:
-    """Say that what an installed package brings cannot be loaded, and why."""
+    """Return that an entry point of an installed package cannot be loaded, and why."""
     package = point.dist.name if point.dist else point.value
     return f"cannot be loaded from the package {package!r}: {one_line(error)}"
+
+
+LONGEST_VALUE = 60
+"""Characters of an invalid value that an error shows."""
+
+
+def complaints(
+    error: ValidationError, model: Any, above: Sequence[str] = (), renamed: Mapping[str, str] | None = None
+) -> list[str]:
+    """Translate pydantic's errors into sentences: the key's path, the problem, and the value found.
+
+    Unknown keys come first, with the nearest known key, since a misspelt key is reported as missing as well.
+
+    Args:
+        error: raised by validating `model`.
+        model: a pydantic model or dataclass.
+        above: the path of the model in the file.
+        renamed: old names of keys, with their new names.
+    """
+    every = error.errors(include_url=False)
+    # where no item of a list fits, pydantic also says that the list is empty
+    every = [problem for problem in every if not (problem["type"] == "too_short" and problem["input"])]
+    every.sort(key=lambda problem: problem["type"] not in UNKNOWN_KEY)
+    return list(dict.fromkeys(_complaint(problem, model, above, renamed or {}) for problem in every))
+
+
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+"""Pydantic's types of error for an unknown key, in a model and in a dataclass."""
+
+
+def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[str, str]) -> str:
+    steps, known = _followed(problem["loc"], model)
+    place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in (*above, *steps)).lstrip(".")
+    if problem["type"] in UNKNOWN_KEY:
+        key = str(problem["loc"][-1])
+        if key in renamed and key not in known:
+            return f"`{place}` is called `{renamed[key]}` now"
+        return f"unknown key `{place}`{nearest(key, known)} (known: {', '.join(known)})"
+    if problem["type"] in ("missing", "missing_argument"):
+        return f"missing key `{place}`"
+    what = problem["msg"].removeprefix("Value error, ")
+    if problem["type"] != "value_error":
+        what += f", found {repr(problem['input'])[:LONGEST_VALUE]}"
+    return f"`{place}`: {what}" if place else what
+
+
+def _followed(loc: Sequence[str | int], model: Any) -> tuple[list[str | int], list[str]]:
+    """Return the steps of a place without pydantic's names for members of unions, and the keys known at its last."""
+    steps: list[str | int] = []
+    kind, known = model, list(_keys(model))
+    for step in loc:
+        members = [member for member in _members(kind) if member is not NoneType]
+        if len(members) > 1 and step not in {key for member in members for key in _keys(member)}:
+            kind = next((m for m in members if step in (_tag(m), getattr(m, "__name__", None))), None)
+            continue  # the name of a member
+        steps.append(step)
+        parts = [part for part in map(_bare, members) if _keys(part)]
+        known = list(dict.fromkeys(key for part in parts for key in _keys(part)))
+        if isinstance(step, int):
+            kind = next((arg for member in members for arg in get_args(_bare(member)) if arg is not Ellipsis), None)
+        else:
+            kind = next((_keys(part)[step] for part in parts if step in _keys(part)), None)
+    return steps, known
+
+
+def _members(kind: Any) -> Iterator[Any]:
+    """Yield what a union is one of; the type itself where it is none."""
+    bare = _bare(kind)
+    if get_origin(bare) in (Union, UnionType):
+        for member in get_args(bare):
+            yield from _members(member)
+    else:
+        yield kind
+
+
+def _bare(kind: Any) -> Any:
+    return _bare(get_args(kind)[0]) if get_origin(kind) is Annotated else kind
+
+
+def _tag(kind: Any) -> str | None:
+    """Return the tag by which a member of a union is told apart; None where it has none."""
+    return next((note.tag for note in getattr(kind, "__metadata__", ()) if hasattr(note, "tag")), None)
+
+
+def _keys(kind: Any) -> dict[str, Any]:
+    """Return the keys of a model or a dataclass as a file writes them, and their types (None: a plain dataclass's)."""
+    fields = getattr(kind, "__pydantic_fields__", None)
+    if fields is None:
+        return dict.fromkeys(getattr(kind, "__dataclass_fields__", ()))
+    return {field.alias or name: field.annotation for name, field in fields.items()}

@@ -1,4 +1,4 @@
-"""A trajectory: arrays of states over time, and how much of the future they have seen."""
+"""A trajectory: arrays of states over time, with the look-ahead of the estimator that made them."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Trajectory:
         t_ns: (n,) increasing.
         R_WB: (n, 3, 3).
         p_WB_W: (n, 3) m.
-        v_WB_W: (n, 3) m/s, where known.
-        b_a, b_g: (n, 3) m/s² and rad/s in the IMU's axes, where known.
-        P: (n, 15, 15) covariance of the error state, where kept; rows of NaN where it was not asked for.
+        v_WB_W: (n, 3) m/s, or None if unknown.
+        b_a, b_g: (n, 3) m/s² and rad/s in the IMU's axes, or None.
+        P: (n, 15, 15) covariance of the error state, or None; rows of NaN where it was not asked for.
         lookahead_s: how much of the future each state has seen: 0 for a filter, the lag for a fixed-lag smoother,
             infinity for a batch.
     """
@@ -77,7 +77,7 @@ class Trajectory:
         )
 
     def state(self, row: int) -> NavState:
-        """Return one row as a state; what is not known is zero."""
+        """Return one row as a state; unknown parts are zero."""
         zero = np.zeros(3)
         return NavState(
             self.R_WB[row],
@@ -89,7 +89,7 @@ class Trajectory:
 
     @classmethod
     def from_beliefs(cls, beliefs: list[Belief], lookahead_s: float = 0.0) -> Trajectory:
-        """Stack beliefs, in time order; P is None where no belief has a covariance."""
+        """Stack beliefs, in time order; P is None if no belief has a covariance."""
         P = np.array([b.P for b in beliefs]).reshape(-1, 15, 15)
         return cls(
             np.array([b.t_ns for b in beliefs], dtype=np.int64),
@@ -115,8 +115,8 @@ class Trajectory:
         """Read a TUM file; times keep their nanoseconds.
 
         Raises:
-            DatasetError: names the file: it is not there or cannot be read, a row without eight numbers, a quaternion
-                more than 1e-3 from unit length, a time that is none, or times out of order.
+            DatasetError: names the file: it is missing or cannot be read, a row without eight numbers, a quaternion
+                more than 1e-3 from unit length, an invalid time, or times out of order.
         """
         path = Path(path)
         t_ns, poses = array("q"), array("d")
@@ -147,10 +147,8 @@ class Trajectory:
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
 
-    def to_pandas(self) -> pd.DataFrame:
-        """Return one row per state: t_ns, R_WB_00.., p_WB_W_x.., and v, b_a, b_g and P_00.. where known."""
-        import pandas as pd
-
+    def to_columns(self) -> dict[str, Array | TimeArray]:
+        """Return arrays (n,): t_ns, R_WB_00.., p_WB_W_x..; where known v, b_a, b_g, and P_0_0.. (j ≥ i)."""
         columns: dict[str, Array | TimeArray] = {"t_ns": self.t_ns}
         for i in range(3):
             for j in range(3):
@@ -161,14 +159,20 @@ class Trajectory:
                 columns |= {f"{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
         if self.P is not None:
             columns |= {f"P_{i}_{j}": self.P[:, i, j] for i in range(15) for j in range(i, 15)}
-        return pd.DataFrame(columns)
+        return columns
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return one row per state, with the columns of `to_columns`."""
+        import pandas as pd
+
+        return pd.DataFrame(self.to_columns())
 
     @classmethod
     def from_pandas(cls, table: pd.DataFrame, lookahead_s: float = 0.0) -> Trajectory:
         """Inverse of `to_pandas`.
 
         Raises:
-            DatasetError: a column is missing, or a time is none.
+            DatasetError: a column is missing, or a time is invalid.
         """
         from .times import times_ns
 

@@ -7,15 +7,16 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from ..datasets.errors import nearest, not_loaded
+from ..datasets.errors import complaints, nearest, not_loaded
 from .dead_reckoning import DeadReckoning
 from .filters.eskf import ErrorStateKalmanFilter
 from .filters.eskf_filterpy import FilterpyKalmanFilter
 from .filters.iekf import InvariantKalmanFilter
 from .filters.rts import RauchTungStriebelSmoother
 from .filters.ukf import UnscentedKalmanFilter
+from .graph.smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother
 from .interface import Estimator
-from .smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother, WindowSmoother
+from .window.smoother import WindowSmoother
 
 ESTIMATORS: dict[str, Any] = {
     "dead-reckoning": DeadReckoning,
@@ -88,5 +89,4 @@ def create(name: str, /, **options: Any) -> Estimator:
     try:
         return kind(**options)
     except ValidationError as error:
-        what = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}, found {e['input']!r}" for e in error.errors())
-        raise EstimatorError(f"{name}: {what}") from None
+        raise EstimatorError(f"{name}: {'; '.join(complaints(error, kind))}") from None

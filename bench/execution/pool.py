@@ -1,33 +1,29 @@
-"""Local workers: processes that do one task at a time, which task each is given, and what becomes of it."""
+"""Local worker processes: each does one task at a time, and is replaced when it dies or hangs."""
 
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections import deque
 from collections.abc import Collection, Generator, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing import Pipe
 from multiprocessing.connection import wait
-from subprocess import PIPE, Popen, TimeoutExpired
-from typing import Any, TypeAlias
+from subprocess import TimeoutExpired
+from typing import TypeAlias
 
+from .child import Child, start
 from .task import Finished, Task
 
-THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")
-"""What libraries read when a process starts; timings are single-threaded."""
-
 GRACE_S = 120.0
-"""A worker that is this far past its run's timeout hangs inside one call, and is killed."""
+"""A worker this far past twice its run's timeout hangs inside one call and is killed, s; starting one takes seconds."""
 
 LogName: TypeAlias = tuple[str, int | None]
 """A log of one experiment: its name and seed."""
 
 
 class Queue:
-    """Tasks that wait, in order, except that those on one log go to one worker as long as the others have logs too."""
+    """Waiting tasks, in order; but a worker keeps to the log that it has in memory, while there are logs for the others."""
 
     def __init__(self, tasks: Iterable[Task]) -> None:
         self._by_log: dict[LogName, deque[Task]] = {}
@@ -61,43 +57,21 @@ def log_of(task: Task) -> LogName:
     return task.run.log.name, task.run.seed
 
 
-def start(descriptor: int) -> Popen[bytes]:
-    """Start a process that does the tasks that come through a connection.
-
-    Libraries in it are single-threaded. It is in a group of its own, where Ctrl-C does not reach it, and ends when the
-    process that started it does.
-    """
-    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-    return Popen(
-        [sys.executable, "-P", "-c", f"from fathom.bench.execution.worker import main; main({descriptor})"],
-        stdin=PIPE,
-        pass_fds=[descriptor],
-        process_group=0,
-        env=os.environ | dict.fromkeys(THREAD_COUNTS, "1") | {"PYTHONPATH": path},
-    )
-
-
 @dataclass(eq=False)
 class Worker:
     """One process, with the task it is at, and the last it was at."""
 
-    connection: Any = field(init=False)
-    process: Any = field(init=False)
+    child: Child = field(default_factory=lambda: start(f"{__package__}.worker:work"))
     task: Task | None = None
     last: Task | None = None
     give_up_s: float = float("inf")
 
-    def __post_init__(self) -> None:
-        self.connection, theirs = Pipe()
-        with theirs:
-            self.process = start(theirs.fileno())
-
     def begin(self, task: Task) -> None:
-        """Hand over a task; a worker that is already dead is found out by `wait`."""
+        """Hand over a task; `wait` notices if the worker is already dead."""
         self.task = self.last = task
         self.give_up_s = time.monotonic() + 2 * task.timeout_s + GRACE_S
         with suppress(OSError):
-            self.connection.send(task)
+            self.child.connection.send(task)
 
     def collect(self) -> Finished:
         """Return what the task left, once the connection is ready or time is out.
@@ -106,24 +80,16 @@ class Worker:
         """
         task = self.task
         assert task is not None
-        if not self.connection.poll():
+        if not self.child.connection.poll():
             return Finished([task.row("failed", "out of time: hung inside one call; its worker was killed")])
         try:
-            finished = self.connection.recv()
+            finished = self.child.connection.recv()
         except (EOFError, OSError):
             with suppress(TimeoutExpired):
-                self.process.wait(10)
-            return Finished([task.row("failed", f"worker died (exit code {self.process.returncode})")])
+                self.child.process.wait(10)
+            return Finished([task.row("failed", f"worker died (exit code {self.child.process.returncode})")])
         self.task = None
         return finished
-
-    def kill(self) -> None:
-        """End the process, whatever it is doing."""
-        self.process.kill()
-        self.process.wait()
-        self.connection.close()
-        if self.process.stdin is not None:
-            self.process.stdin.close()
 
 
 def run_all(tasks: Sequence[Task], jobs: int = 0) -> Generator[Finished]:
@@ -140,18 +106,18 @@ def run_all(tasks: Sequence[Task], jobs: int = 0) -> Generator[Finished]:
                     others = [other.last for other in workers if other is not worker]
                     worker.begin(queue.take(worker.last, others))
             busy = [worker for worker in workers if worker.task]
-            ready = wait([worker.connection for worker in busy], max(0.0, _soonest(busy) - time.monotonic()))
+            ready = wait([worker.child.connection for worker in busy], max(0.0, _soonest(busy) - time.monotonic()))
             for worker in busy:
-                if worker.connection not in ready and time.monotonic() <= worker.give_up_s:
+                if worker.child.connection not in ready and time.monotonic() <= worker.give_up_s:
                     continue
                 finished = worker.collect()
                 if worker.task is not None:  # it did not survive
-                    worker.kill()
+                    worker.child.kill()
                     workers[workers.index(worker)] = Worker()
                 yield finished
     finally:
         for worker in workers:
-            worker.kill()
+            worker.child.kill()
 
 
 def _soonest(workers: Sequence[Worker]) -> float:

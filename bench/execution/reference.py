@@ -23,7 +23,7 @@ from ..experiment.variants import changed
 from ..results.store import Store
 from ..results.summary import Record, groups, records, summarise
 from .task import Task
-from .worker import Bench
+from .worker import WorkerCache
 
 SHORT = {
     "duration_s": 40.0,
@@ -93,7 +93,7 @@ def _short(log: LogSpec) -> LogSpec:
     return replace(log, scenario=log.scenario | less)
 
 
-class _Untimed(Bench):
+class _Untimed(WorkerCache):
     """Runs one thing after the other in this process; as nothing is timed, nothing is warmed up."""
 
     def estimator(self, task: Task) -> Estimator:

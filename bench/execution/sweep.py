@@ -1,17 +1,21 @@
-"""Run an experiment: what is missing in the store, the longest first, and every finished run in the store at once."""
+"""Run an experiment: what is missing in the store, and every finished run into the store at once."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
+from time import monotonic
 from typing import Any, NamedTuple
 
 import pandas as pd
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ...datasets.described.opening import RecordingNotFound
 from ..errors import ExperimentError
@@ -23,6 +27,13 @@ from .dask_pool import run_on_cluster
 from .pool import run_all
 from .task import Task
 
+FIRST_SHARE = 0.1
+"""A log whose runs are at most this share of the work goes first, so that its table is there early. It costs little:
+the longest of the other runs begin a tenth of the time later at most."""
+
+LINE_EVERY_S = 10.0
+"""Where there is no terminal, a line of progress comes at most this often: some twenty in a log of `make bench`."""
+
 
 class Outcome(NamedTuple):
     """What a sweep left in the store.
@@ -31,7 +42,7 @@ class Outcome(NamedTuple):
         rows: of the store, one per run and output.
         standing: how many runs were in the store already.
         renewed: how many stood there under another identity and were run anew.
-        kept: why a log did not run whose rows of an earlier day are kept.
+        kept: why a log did not run whose rows of an earlier day are kept, by its name.
     """
 
     rows: pd.DataFrame
@@ -50,13 +61,26 @@ def run_experiment(
     force: bool = False,
     dask: str | None = None,
 ) -> pd.DataFrame:
-    """Run every estimator on every log and return the rows of the store, one per run and output.
+    """Run every estimator on every log and return the rows of the store, one per run and output; see `sweep`."""
+    return sweep(experiment, data, out, jobs, only, repair, force, dask).rows
 
-    What is in the store already, under its `ledger.identity`, is not run again: `attrs["standing"]` says how many runs
-    that were, `attrs["renewed"]` how many stood there under another identity and were made anew. A run that fails,
-    diverges, or kills its worker is a row that says so. Interrupted (KeyboardInterrupt), the finished runs are in the
-    store. A run whose recording is not here keeps the rows of an earlier day; `attrs["kept"]` then maps its log to why
-    it did not run.
+
+def sweep(
+    experiment: Experiment | str | Path,
+    data: Path | str | None = None,
+    out: Path | str = "results",
+    jobs: int = 0,
+    only: str | None = None,
+    repair: bool = False,
+    force: bool = False,
+    dask: str | None = None,
+    finished_log: Callable[[pd.DataFrame], None] | None = None,
+) -> Outcome:
+    """Run what is missing in the store, and say what is there afterwards.
+
+    A run that is in the store under its `identity` is not run again. A run that fails, diverges, or kills its worker is
+    a row that says so. Interrupted (KeyboardInterrupt), the finished runs are in the store. A run whose recording is
+    not here keeps the rows of an earlier day.
 
     Args:
         experiment: an experiment, a shipped one's name, or a YAML file.
@@ -66,7 +90,8 @@ def run_experiment(
         only: run only what matches this pattern: an estimator's label, a log's name, or "log/label".
         repair: let loaders drop bad rows, and count them.
         force: run what is in the store already, too.
-        dask: address of a Dask scheduler, its scheduler file, or "local", see `cluster`; else worker processes here.
+        dask: address of a Dask scheduler, its scheduler file, or "local", see `dask_pool`; else worker processes here.
+        finished_log: called with the rows of a log as soon as the last of its runs has ended.
 
     Raises:
         ExperimentError, EstimatorError, DatasetError: nothing was run.
@@ -77,25 +102,51 @@ def run_experiment(
         raise ExperimentError(f"jobs must be 0 (one per core) or more, found {jobs}")
     folder = Path(out) / experiment.name
     runs = _select(experiment, only)
-    tasks, absent = _order([Task.of(experiment, run, Path(data) if data else None, repair) for run in runs])
+    tasks, absent, duration_s = _opened(
+        [Task.of(experiment, run, Path(data) if data else None, repair) for run in runs]
+    )
     _make_room(folder)
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
         missing, renewed = _missing(tasks, store, force)
-        if dask in (None, "local"):
-            compile_first(task.run.estimator.create() for task in missing)
-        with (
-            _progress(len(missing), len(tasks) - len(missing)) as (advance, say),
-            closing(run_all(missing, jobs) if dask is None else run_on_cluster(missing, dask, jobs, say)) as finished,
-        ):
-            for each in finished:
-                rows = each.keep(folder)
-                store.write(rows)
-                advance(rows)
+        left = Counter(task.run.log.name for task in missing)
+        progress = _Progress(len(missing))
+        for batch in _batches(missing, duration_s):
+            if dask in (None, "local"):
+                compile_first(task.run.estimator.create() for task in batch)
+            ended = run_all(batch, jobs) if dask is None else run_on_cluster(batch, dask, jobs, progress.say)
+            with progress, closing(ended):
+                for each in ended:
+                    rows = each.keep(folder)
+                    store.write(rows)
+                    progress.advance(rows)
+                    log = rows[0]["log"]
+                    left[log] -= 1
+                    if finished_log is not None and left[log] == 0:
+                        progress.clear()
+                        finished_log(rows_of(store.read(log), runs))
         _sweep(folder / "trajectories", store.trajectories())
-        rows = rows_of(store.read(), runs)
-    rows.attrs |= {"kept": kept, "standing": len(tasks) - len(missing), "renewed": renewed}
-    return rows
+        return Outcome(rows_of(store.read(), runs), len(tasks) - len(missing), renewed, kept)
+
+
+def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[Task]]:
+    """Return the tasks in the order to run them, in batches; runs on one log are neighbours, so workers load it once.
+
+    The longest logs come first, so that no worker is left alone with one at the end. But the log with the least work is
+    a batch of its own ahead of them, where it has a small share of the work; only what it needs is compiled before it.
+    """
+
+    def longest(task: Task) -> tuple[float, str, int, float]:
+        return (-duration_s[task.run.log.name], task.run.log.name, task.run.seed or 0, -task.run.estimator.lag_s)
+
+    ordered = sorted(tasks, key=longest)
+    work_s: Counter[str] = Counter()
+    for task in ordered:
+        work_s[task.run.log.name] += duration_s[task.run.log.name]  # type: ignore[assignment]
+    least = min(work_s, key=lambda log: work_s[log], default="")
+    if len(work_s) < 2 or work_s[least] > FIRST_SHARE * work_s.total():
+        return [ordered] if ordered else []
+    return [[t for t in ordered if t.run.log.name == least], [t for t in ordered if t.run.log.name != least]]
 
 
 def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Task], int]:
@@ -149,11 +200,10 @@ def _select(experiment: Experiment, only: str | None) -> list[Run]:
     return chosen
 
 
-def _order(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]]]:
-    """Open each recorded log once, now, so that bad input ends everything; then put the longest runs first.
+def _opened(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]], dict[str, float]]:
+    """Open each recorded log once, so that bad input ends everything before a run begins.
 
-    Returns the tasks whose log is here (runs on one log stay neighbours, so workers load it once), and a row for each
-    of the others.
+    Returns the tasks whose log is here, a row for each of the others, and how long each log is, s.
     """
     duration_s: dict[str, float] = {}
     readings: dict[str, str] = {}
@@ -176,11 +226,7 @@ def _order(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]]]:
         if task.run.log.name in duration_s
     ]
     absent = [task.row("absent", missing[task.run.log.name]) for task in tasks if task.run.log.name in missing]
-
-    def longest(task: Task) -> tuple[float, str, int, float]:
-        return (-duration_s[task.run.log.name], task.run.log.name, task.run.seed or 0, -task.run.estimator.lag_s)
-
-    return sorted(here, key=longest), absent
+    return here, absent, duration_s
 
 
 def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
@@ -208,26 +254,44 @@ def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
     return pd.Series([is_old(row) for row in rows.itertuples()], index=rows.index, dtype=bool)
 
 
-@contextmanager
-def _progress(missing: int, standing: int) -> Iterator[tuple[Callable[[Sequence[Row]], None], Callable[[str], None]]]:
-    """Give functions to call with each finished run's rows, and with a message; the bar is for terminals only."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+class _Progress:
+    """How many runs are finished of how many, on stderr: a bar on a terminal, elsewhere a line now and then."""
 
-    columns = (
-        TextColumn("runs"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.description}", markup=False),
-    )
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("", total=missing + standing, completed=standing)
+    def __init__(self, total: int) -> None:
+        self.done, self.total, self.line_s = 0, total, monotonic()
+        self.terminal = sys.stderr.isatty()
+        columns = (
+            TextColumn("runs"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.description}", markup=False),
+        )
+        self.bar = Progress(
+            *columns, console=Console(stderr=True), disable=not self.terminal, transient=True, redirect_stdout=False
+        )
+        self.task = self.bar.add_task("", total=total)
 
-        def advance(rows: Sequence[Row]) -> None:
-            bar.update(task, advance=1, description=f"{rows[0]['log']} / {rows[0]['label']}: {rows[0]['status']}")
+    def advance(self, rows: Sequence[Row]) -> None:
+        """Count a finished run, by its rows."""
+        self.done += 1
+        what = f"{rows[0]['log']} / {rows[0]['label']}: {rows[0]['status']}"
+        self.bar.start()  # `clear` may have stopped it
+        self.bar.update(self.task, advance=1, description=what)
+        if not self.terminal and monotonic() > self.line_s + LINE_EVERY_S:
+            self.line_s = monotonic()
+            self.say(f"{self.done} of {self.total} runs finished; the last: {what}")
 
-        def say(message: str) -> None:
-            bar.console.print(message, markup=False, highlight=False, soft_wrap=True)
+    def say(self, message: str) -> None:
+        """Print a message above the bar."""
+        self.bar.console.print(message, markup=False, highlight=False, soft_wrap=True)
 
-        yield advance, say
+    def clear(self) -> None:
+        """Take the bar away until the next run is finished, so that others can print."""
+        self.bar.stop()
+
+    def __enter__(self) -> None:
+        self.bar.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()

@@ -1,4 +1,4 @@
-"""In a worker: open a task's log, run its estimator, score what it said, and hand back rows and trajectories."""
+"""In a worker: open a task's log, run its estimator, score it, and return rows and trajectories."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import ctypes
 import gc
 import json
 import math
-import os
-import threading
 from collections import OrderedDict
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -34,33 +32,21 @@ from .result import Result, costs, innovation_dof, innovation_scores
 from .task import Finished, Task, file_name, parquet
 
 LOGS_KEPT = 2
-"""How many logs a worker keeps in memory, so that estimators share them."""
-
-
-def main(descriptor: int) -> None:
-    """Be a worker process: do the tasks that come through a connection, as long as there is a parent."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    work(Connection(descriptor))
-
-
-def _end_with_parent() -> None:
-    """Wait until the standard input closes, as it does when the parent is gone, however it went; then end at once."""
-    os.read(0, 1)
-    os._exit(1)
+"""How many logs a worker keeps in memory, so that estimators share them: the one it is at, and one taken over."""
 
 
 def work(connection: Connection) -> None:
-    """Do tasks until there are no more, or nobody to tell."""
-    bench = Bench()
+    """Do tasks until the connection closes."""
+    cache = WorkerCache()
     while True:
         try:
-            connection.send(bench.execute(connection.recv()))
+            connection.send(cache.execute(connection.recv()))
         except (EOFError, OSError):
             return
 
 
-class Bench:
-    """What a worker keeps from one task to the next: the last logs with what is made of them, what is compiled."""
+class WorkerCache:
+    """What a worker keeps from one task to the next: the last logs, their floors and truths, and what is compiled."""
 
     def __init__(self) -> None:
         self.logs: OrderedDict[str, Log] = OrderedDict()
@@ -69,7 +55,7 @@ class Bench:
         self.warm: set[str] = set()
 
     def execute(self, task: Task) -> Finished:
-        """Do one run and return what it leaves, whatever happens."""
+        """Do one run and return its rows and trajectories; an error becomes a row."""
         started = datetime.now(UTC).isoformat(timespec="seconds")
         try:
             log = self.open(task)
@@ -108,6 +94,8 @@ class Bench:
         if repr(estimator) not in self.warm:
             warm_up(estimator)
             self.warm.add(repr(estimator))
+            gc.collect()
+            gc.freeze()  # what imports and compiling made stays: no later collection walks through it again
         return estimator
 
     def floor(self, task: Task, result: Result, lookahead_s: float) -> dict[str, float | None]:
@@ -157,7 +145,7 @@ class Bench:
                 row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
             try:
                 row |= self.floor(task, result, trajectory.lookahead_s)
-            except ScoreError as error:  # a look-ahead that is none, say: the run is none the worse
+            except ScoreError as error:  # a look-ahead that is not defined, say: the other scores stand
                 row["notes"] = json.dumps([*log.notes, *result.notes, str(error)])
             if can_judge(log, scoring):
                 row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
@@ -166,7 +154,7 @@ class Bench:
 
 
 def log_key(task: Task) -> str:
-    """Return what tells the task's log from any other."""
+    """Return a key that is equal for equal logs only."""
     return json.dumps([plain(task.run.log), task.run.seed, task.repair, str(task.data), task.readings_sha256])
 
 
@@ -191,7 +179,10 @@ def open_same(task: Task) -> Log:
 
 
 class _PeakMemory:
-    """Highest resident memory within the block above that at its start, MB; None where the system does not tell."""
+    """Peak of resident memory inside the block, less that at its start, MB; None where the system does not report it.
+
+    Memory that earlier runs left is given back before, or the peak would hide in it.
+    """
 
     def __enter__(self) -> _PeakMemory:
         self.peak_mb: float | None = None

@@ -1,4 +1,4 @@
-"""What runs leave behind: one SQLite file per experiment, one transaction per finished run."""
+"""The store of an experiment: one SQLite file, one transaction per finished run."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ TIMES = {
     "step_histogram": "TEXT",  # JSON: how many steps took how long, see `step_time.step_histogram`
 }
 ORIGIN = {
-    "identity": "TEXT",  # see `ledger.identity`
+    "identity": "TEXT",  # see `identity`
     "estimator": "TEXT",
     "spec": "TEXT",  # JSON
     "counts": "TEXT",  # JSON
@@ -58,16 +58,14 @@ ORIGIN = {
     "machine": "TEXT",  # JSON
 }
 COLUMNS = NAMES | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | TIMES | ORIGIN
-RENAMED = {"anees_position": "nees_position"}
-"""Columns that an older version called otherwise."""
 SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"
 
 
 class Store:
-    """The rows of one experiment; a file made by an older version gains the columns it lacks.
+    """The rows of one experiment.
 
     Raises:
-        ExperimentError: the file is there and is not such a store.
+        ExperimentError: the file is there and is not such a store, or has other columns.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,6 +77,9 @@ class Store:
             raise ExperimentError(f"{path}: cannot be written ({error}); give another --out") from None
         try:
             self._prepare()
+        except _OtherColumnsError as error:
+            self.connection.close()
+            raise ExperimentError(f"{path}: {error}") from None
         except sqlite3.Error as error:
             self.connection.close()
             raise ExperimentError(
@@ -91,17 +92,11 @@ class Store:
         run("PRAGMA synchronous = FULL")
         with self.connection:
             run(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())})")
-            there = _columns(self.connection)
-            for old, new in RENAMED.items():
-                if old in there and new not in there:
-                    run(f"ALTER TABLE runs RENAME COLUMN {old} TO {new}")
-                    there.add(new)
-            for name in COLUMNS.keys() - there:
-                run(f"ALTER TABLE runs ADD COLUMN {name} {COLUMNS[name]}")
+            _check_columns(self.connection)
             run("CREATE UNIQUE INDEX IF NOT EXISTS one_row ON runs (experiment, log, label, ifnull(seed, -1), output)")
 
     def write(self, rows: Sequence[Row]) -> None:
-        """Put the rows of one run in place of what an earlier run of the same name left, all or nothing.
+        """Replace the rows of an earlier run of the same name by these, in one transaction.
 
         Raises:
             ExperimentError: the disk is full, or the file cannot be written.
@@ -127,7 +122,7 @@ class Store:
         return True
 
     def finished(self) -> set[tuple[str, str, int | None, str | None]]:
-        """Return log, label, seed and identity (None: by an older version) of every run that came to a final end."""
+        """Return log, label, seed and identity of every run that is done or diverged."""
         final = ", ".join(f"'{status}'" for status in FINAL)
         query = f"SELECT DISTINCT log, label, seed, identity FROM runs WHERE status IN ({final})"
         return set(self.connection.execute(query))
@@ -137,9 +132,9 @@ class Store:
         query = "SELECT trajectory FROM runs UNION SELECT truth_trajectory FROM runs"
         return {name for (name,) in self.connection.execute(query) if name is not None}
 
-    def read(self) -> pd.DataFrame:
-        """Return every row, in the order in which they were written."""
-        return read_rows(self.connection)
+    def read(self, log: str | None = None) -> pd.DataFrame:
+        """Return every row, or those of one log, in the order in which they were written."""
+        return read_rows(self.connection, log)
 
     def close(self) -> None:
         """Fold the write-ahead log into the file and let go of it."""
@@ -152,18 +147,28 @@ class Store:
         self.close()
 
 
-def _columns(connection: sqlite3.Connection) -> set[str]:
-    return {row[1] for row in connection.execute("PRAGMA table_info(runs)")}
+class _OtherColumnsError(sqlite3.DatabaseError):
+    """The table `runs` is not of this version; says what to do."""
 
 
-def read_rows(connection: sqlite3.Connection) -> pd.DataFrame:
-    """Return the rows of an open store; columns that an older version did not know are empty."""
-    there = _columns(connection)
-    known = [name for name in COLUMNS if name in there]
-    if not known:
+def _check_columns(connection: sqlite3.Connection) -> None:
+    there = {row[1] for row in connection.execute("PRAGMA table_info(runs)")}
+    if not there:
         raise sqlite3.DatabaseError("no table `runs` in it")
-    cursor = connection.execute(f"SELECT {', '.join(known)} FROM runs ORDER BY rowid")
-    table = pd.DataFrame(cursor.fetchall(), columns=known).reindex(columns=list(COLUMNS))
+    for what, names in (("lacks", COLUMNS.keys() - there), ("has an unknown", there - COLUMNS.keys())):
+        if names:
+            raise _OtherColumnsError(
+                f"another version wrote it: it {what} column {min(names)}; read it with that version, or move it away "
+                "and run the experiment again"
+            )
+
+
+def read_rows(connection: sqlite3.Connection, log: str | None = None) -> pd.DataFrame:
+    """Return the rows of an open store, or those of one log."""
+    _check_columns(connection)
+    chosen = "" if log is None else "WHERE log IS :log"
+    query = f"SELECT {', '.join(COLUMNS)} FROM runs {chosen} ORDER BY rowid"
+    table = pd.DataFrame(connection.execute(query, {"log": log}).fetchall(), columns=list(COLUMNS))
     numbers = [name for name, kind in COLUMNS.items() if kind == "REAL"]
     return table.astype(dict.fromkeys(numbers, "float64") | {"seed": "Int64"})
 
@@ -182,6 +187,8 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
         uri = f"{path.resolve().as_uri()}{'?immutable=1' if alone else ''}"
         with closing(sqlite3.connect(uri, uri=True)) as connection:
             return read_rows(connection)
+    except _OtherColumnsError as error:
+        raise ExperimentError(f"{path}: {error}") from None
     except sqlite3.Error as error:
         raise ExperimentError(f"{path}: cannot be read as a store of runs ({error})") from None
 

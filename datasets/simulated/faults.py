@@ -1,7 +1,7 @@
-"""Faults: what goes wrong with a sensor and no estimator is told of.
+"""Faults of simulated sensors, of which no estimator is told.
 
-Each is a dial that is off by default, and draws from a random stream of its own. A fault belongs to the log alone: the
-rig says what was meant, the log what happened. Faults keep their size when a scenario scales its noise.
+Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig. They keep
+their size when a scenario scales its noise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..state import Array, TimeArray
 from .random_streams import random_stream
 
 LONGEST_CLOCK_OFFSET_S = 5.0
-"""Well inside the margin that a mission's splines have beyond both its ends."""
+"""Largest clock offset, s: well inside the margin of a mission's splines beyond both its ends."""
 
 
 def _in_order(interval: tuple[float, float]) -> tuple[float, float]:
@@ -34,7 +34,7 @@ ClockOffset = Annotated[float, Field(ge=-LONGEST_CLOCK_OFFSET_S, le=LONGEST_CLOC
 
 
 class Marring(NamedTuple):
-    """What befalls the values of one sensor, in the unit of its readings; each figure a number, or one per column."""
+    """Outlier sigma, saturation limit and quantisation step, in the unit of a sensor's readings; one, or per column."""
 
     outlier: float | Array
     limit: float | Array = np.inf
@@ -43,14 +43,14 @@ class Marring(NamedTuple):
 
 @dataclass(frozen=True, config=STRICT)
 class Faults:
-    """What can befall any sensor.
+    """Faults that any sensor can have.
 
     Attributes:
-        dropout_probability: of each reading, to get lost.
+        dropout_probability: of each reading, to be lost.
         outages_s: [from, to] pairs, s from the log's start: no reading is stamped inside.
         outlier_probability: of each reading, to carry a gross error: normal, zero-mean, with the standard deviation of
             the sensor's own `outlier` dial on every axis (a contaminated normal distribution).
-        repeat_probability: of each reading, to say again what the one before it said, at its own time.
+        repeat_probability: of each reading, to repeat the values of the one before it, at its own time.
         clock_offset_s: readings are stamped this much later than they were true; reception is by the right clock, but
             never before the stamp.
     """
@@ -70,21 +70,21 @@ class DvlFaults(Faults):
         scale: of the velocity it reads to the true one: a wrong speed of sound.
         misalignment_deg: roll, pitch and yaw of its true axes in B, which the rig says are B's.
         lever_arm_error_m: where it really is, in B; the rig says at its origin.
-        limit_mps: what no component of a reading exceeds.
-        quantum_mps: to the nearest multiple of which each component is rounded.
+        limit_m_s: what no component of a reading exceeds.
+        quantum_m_s: to the nearest multiple of which each component is rounded.
     """
 
-    outlier_mps: NotNegative = 1.0
+    outlier_m_s: NotNegative = 1.0
     scale: Positive = 1.0
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
     lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
-    limit_mps: Positive | None = None
-    quantum_mps: NotNegative = 0.0
+    limit_m_s: Positive | None = None
+    quantum_m_s: NotNegative = 0.0
 
     @property
     def marring(self) -> Marring:
         """In m/s."""
-        return Marring(self.outlier_mps, _none_is_infinite(self.limit_mps), self.quantum_mps)
+        return Marring(self.outlier_m_s, _none_is_infinite(self.limit_m_s), self.quantum_m_s)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -156,20 +156,20 @@ class ImuFaults(Faults):
         gyro_scale, accel_scale: of what each axis reads to the truth, before bias and noise.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
         lever_arm_error_m: where it really is, less where the rig says, in B.
-        gyro_limit_dps, accel_limit_mps2: where a sample saturates; it is the mean over an interval that is clipped.
-        gyro_quantum_dps, accel_quantum_mps2: to the nearest multiple of which a sample is rounded.
+        gyro_limit_deg_s, accel_limit_m_s2: where a sample saturates; it is the mean over an interval that is clipped.
+        gyro_quantum_deg_s, accel_quantum_m_s2: to the nearest multiple of which a sample is rounded.
     """
 
-    gyro_outlier_dps: NotNegative = 20.0
-    accel_outlier_mps2: NotNegative = 5.0
+    gyro_outlier_deg_s: NotNegative = 20.0
+    accel_outlier_m_s2: NotNegative = 5.0
     gyro_scale: Vector = (1.0, 1.0, 1.0)
     accel_scale: Vector = (1.0, 1.0, 1.0)
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
     lever_arm_error_m: Vector = (0.0, 0.0, 0.0)
-    gyro_limit_dps: Positive | None = None
-    accel_limit_mps2: Positive | None = None
-    gyro_quantum_dps: NotNegative = 0.0
-    accel_quantum_mps2: NotNegative = 0.0
+    gyro_limit_deg_s: Positive | None = None
+    accel_limit_m_s2: Positive | None = None
+    gyro_quantum_deg_s: NotNegative = 0.0
+    accel_quantum_m_s2: NotNegative = 0.0
 
     @property
     def marring(self) -> Marring:
@@ -179,9 +179,9 @@ class ImuFaults(Faults):
             return np.repeat([accel, gyro * DEGREE], 3)
 
         return Marring(
-            six(self.accel_outlier_mps2, self.gyro_outlier_dps),
-            six(_none_is_infinite(self.accel_limit_mps2), _none_is_infinite(self.gyro_limit_dps)),
-            six(self.accel_quantum_mps2, self.gyro_quantum_dps),
+            six(self.accel_outlier_m_s2, self.gyro_outlier_deg_s),
+            six(_none_is_infinite(self.accel_limit_m_s2), _none_is_infinite(self.gyro_limit_deg_s)),
+            six(self.accel_quantum_m_s2, self.gyro_quantum_deg_s),
         )
 
     @property

@@ -16,7 +16,7 @@ from .scenario import Scenario
 
 
 def sample_imu(scenario: Scenario, seed: int, motion: Motion, edges_ns: TimeArray, biases: Array) -> ImuStream:
-    """Return the IMU's samples: means of the motion, plus bias and white noise, marred by its faults.
+    """Return the IMU's samples: means of the motion, plus bias and white noise, with the IMU's faults.
 
     Args:
         scenario: what is simulated.
@@ -25,10 +25,10 @@ def sample_imu(scenario: Scenario, seed: int, motion: Motion, edges_ns: TimeArra
         edges_ns: (n + 1,) where the intervals begin and end by the IMU's clock, from the start.
         biases: (n + 1, 6) of (f, w) at the edges; a sample carries that of its interval's beginning.
     """
-    faults, noise = scenario.imu_faults, scenario.imu_noise
+    faults, noise = scenario.imu.faults, scenario.imu.figures
     true_ns = edges_ns - round(faults.clock_offset_s * 1e9)
     signal = np.hstack(
-        mean_imu(motion, scenario.mountings["imu"], scenario.gravity_mps2, true_ns, scenario.earth_rate_radps)
+        mean_imu(motion, scenario.mountings["imu"], scenario.gravity_m_s2, true_ns, scenario.earth_rate_rad_s)
     )
     white = simulate_white_noise(noise, edges_ns, seed) * scenario.noise_scale
     samples = mar(signal * faults.scale + biases[:-1] + white, faults, "imu", seed)

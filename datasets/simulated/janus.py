@@ -1,4 +1,4 @@
-"""A four-beam Janus DVL: which of its beams have bottom lock, and the velocity that those give."""
+"""A four-beam Janus DVL: bottom lock of each beam, and the velocity from the locked ones."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def janus_beams(beam_angle_rad: float) -> Array:
 def read_dvl(
     scenario: Scenario, spec: DvlSpec, dvl: Mounting, motion: Motion, t_s: Array, seed: int
 ) -> tuple[Array, Array, Array]:
-    """Return v_WD_D (n, 3) where there is bottom lock and NaN elsewhere, its error (n, 3), and its sigma (n, 3).
+    """Return v_WD_D (n, 3), NaN without bottom lock, its error (n, 3), and its sigma (n, 3).
 
     The velocity is the least-squares solution of its beams, and its sigma their figure of merit: the square roots of
-    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors of which
-    each two are correlated by ±1/2; a reading has no place for that: its sigmas are right, axis by axis, and no more.
+    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors that are
+    correlated by ±1/2 in pairs. A reading has no correlations, so its sigmas are right axis by axis only.
     """
     R_WB, p_WB_W, v_WB_W = motion.pose(t_s)
     v_WD_B = np.einsum("nji,nj->ni", R_WB, v_WB_W)
@@ -39,8 +39,8 @@ def read_dvl(
     v_WD_D = spec.faults.scale * v_WD_B @ dvl.R_BS
 
     A = janus_beams(spec.beam_angle_deg * DEGREE)
-    beam_error = spec.beam_sigma_mps * random_stream(seed, "dvl").standard_normal((len(t_s), 4))
-    error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, spec.beam_sigma_mps), (len(t_s), 1))
+    beam_error = spec.beam_sigma_m_s * random_stream(seed, "dvl").standard_normal((len(t_s), 4))
+    error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, spec.beam_sigma_m_s), (len(t_s), 1))
     if scenario.seabed is None and spec.max_tilt_deg is None and not spec.beam_loss_probability:
         return v_WD_D, error, sigma
 
@@ -48,14 +48,14 @@ def read_dvl(
     for lost in range(4):
         rows, others = ~locked[:, lost] & (locked.sum(axis=1) == 3), np.arange(4) != lost
         error[rows] = beam_error[rows][:, others] @ np.linalg.inv(A[others]).T
-        sigma[rows] = figure_of_merit(A[others], spec.beam_sigma_mps)
+        sigma[rows] = figure_of_merit(A[others], spec.beam_sigma_m_s)
     enough = locked.sum(axis=1) >= (3 if spec.three_beams else 4)
     return np.where(enough[:, None], v_WD_D, np.nan), error, sigma
 
 
-def figure_of_merit(A: Array, beam_sigma_mps: float) -> Array:
+def figure_of_merit(A: Array, beam_sigma_m_s: float) -> Array:
     """Return the standard deviation of each component of the velocity that beams A (m, 3) give, (3,) m/s."""
-    return beam_sigma_mps * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
+    return beam_sigma_m_s * np.sqrt(np.diag(np.linalg.inv(A.T @ A)))
 
 
 def bottom_lock(scenario: Scenario, spec: DvlSpec, R_WD: Array, p_WD_W: Array, seed: int) -> NDArray[np.bool_]:

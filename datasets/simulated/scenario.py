@@ -8,15 +8,14 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
-from ..errors import DatasetError, nearest
+from ..errors import DatasetError, complaints, nearest
 from ..quantities import STRICT, Finite, NotNegative, Positive
 from ..rig import ImuNoise, Mounting, Rig
 from ..state import Array
-from .faults import AnyFaults, DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults, true_mounting
-from .imu_grades import IMU_GRADES
+from .faults import AnyFaults, true_mounting
 from .seabed import SeabedSpec
 from .specs import (
     MISSIONS,
@@ -26,7 +25,7 @@ from .specs import (
     DvlSpec,
     GpsSpec,
     HeadingSpec,
-    MountingSpec,
+    ImuSpec,
     PriorSpec,
     TideSpec,
     WavesSpec,
@@ -35,10 +34,26 @@ from .specs import (
 CLEARANCE_M = 0.5
 """Least height of a mission's deepest point above the seabed."""
 
-Imu = Annotated[
-    Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
-    Discriminator(lambda imu: "grade" if isinstance(imu, str) else "figures"),
-]
+CALLED_NOW = {
+    "speed_mps": "speed_m_s",
+    "gravity_mps2": "gravity_m_s2",
+    "beam_sigma_mps": "beam_sigma_m_s",
+    "velocity_mps": "velocity_m_s",
+    **{f"{dial}_mps": f"{dial}_m_s" for dial in ("outlier", "limit", "quantum")},
+    **{f"accel_{dial}_mps2": f"accel_{dial}_m_s2" for dial in ("outlier", "limit", "quantum")},
+    **{f"gyro_{dial}_dps": f"gyro_{dial}_deg_s" for dial in ("outlier", "limit", "quantum")},
+    **{f"imu_{name}": f"imu.{name}" for name in ("rate_hz", "bias_correlation_s", "faults")},
+    **{f"{sensor}_mounting": f"{sensor}.mounting" for sensor in ("imu", "depth", "gps", "heading")},
+    **{name: f"noise.{name}" for name in ImuNoise.__dataclass_fields__},
+    "roll_pitch_yaw_deg": "roll_deg, pitch_deg and yaw_deg",
+    "lever_arm_m": "translation_m",
+}
+"""What keys of older scenarios are called now."""
+
+
+def _of_this_noise(imu: Any) -> Any:
+    """Return the IMU that is meant where only its noise is given."""
+    return {"noise": imu} if isinstance(imu, str | ImuNoise) else imu
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -52,10 +67,10 @@ class Scenario:
 
     mission: str = "lawnmower"  # a name in MISSIONS, or "recorded"
     duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
-    imu: Imu = "tactical"  # a name in IMU_GRADES, or figures of one's own
+    imu: Annotated[ImuSpec, BeforeValidator(_of_this_noise)] = ImuSpec()  # or its noise alone: "tactical"
 
     # the path
-    speed_mps: Positive = 1.5
+    speed_m_s: Positive = 1.5
     depth_m: Positive = 20.0  # where level missions run, and yo-yo and helix turn upwards
     shallow_m: NotNegative = 5.0  # where yo-yo and helix turn downwards
     climb_deg: Annotated[float, Field(gt=0, le=45)] = 20.0  # of every climb and dive, but the helix's
@@ -79,16 +94,9 @@ class Scenario:
     tide: TideSpec | None = None
 
     # the vehicle
-    gravity_mps2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
-    imu_mounting: MountingSpec = MountingSpec((180.0, 2.0, 87.0), (-0.35, 0.05, 0.12))
-    depth_mounting: MountingSpec = MountingSpec((0.0, 0.0, 0.0), (0.40, -0.06, 0.05))
-    gps_mounting: MountingSpec = MountingSpec((0.0, 0.0, 0.0), (-0.25, 0.0, 0.30))
-    heading_mounting: MountingSpec = MountingSpec((1.5, -2.0, 4.0), (0.55, 0.0, 0.05))
+    gravity_m_s2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
 
     # the sensors
-    imu_rate_hz: Positive = 100.0
-    imu_bias_correlation_s: Positive | None = None  # of Gauss–Markov biases; None: they walk
-    imu_faults: ImuFaults = ImuFaults()
     dvl: DvlSpec | None = DvlSpec()
     depth: DepthSpec | None = DepthSpec()
     gps: GpsSpec | None = GpsSpec()
@@ -104,17 +112,6 @@ class Scenario:
         if name not in known:
             raise ValueError(f"no mission {name!r}{nearest(name, known)}; known: {', '.join(known)}")
         return name
-
-    @field_validator("imu")
-    @classmethod
-    def _known_grade(cls, imu: str | ImuNoise) -> str | ImuNoise:
-        if isinstance(imu, str) and imu not in IMU_GRADES:
-            raise ValueError(f"no IMU grade {imu!r}{nearest(imu, IMU_GRADES)}; known: {', '.join(IMU_GRADES)}")
-        if isinstance(imu, ImuNoise):
-            for name, value in dataclasses.asdict(imu).items():
-                if not (math.isfinite(value) and (value > 0 or (value == 0 and name.endswith("walk")))):
-                    raise ValueError(f"{name} must be positive and finite, found {value}")
-        return imu
 
     @model_validator(mode="after")
     def _saw_has_teeth(self) -> Scenario:
@@ -160,18 +157,7 @@ class Scenario:
         try:
             return cls(**{str(key): value for key, value in values.items()})
         except ValidationError as error:
-            errors = error.errors()  # a misspelt key is also a missing one: tell of the spelling
-            first = min(errors, key=lambda e: e["type"] != "unexpected_keyword_argument")
-            path = [str(part) for part in first["loc"] if part not in ("grade", "figures")]
-            where = ": ".join([source, ".".join(path)] if path else [source])
-            if first["type"] == "unexpected_keyword_argument":
-                known = _fields_at(path[:-1])
-                raise DatasetError(
-                    f"{where}: unknown key{nearest(path[-1], known)}; known: {', '.join(known)}"
-                ) from None
-            what = first["msg"].removeprefix("Value error, ")
-            found = "" if first["type"] == "value_error" else f", found {first['input']!r}"
-            raise DatasetError(f"{where}: {what}{found}") from None
+            raise DatasetError(f"{source}: {complaints(error, cls, renamed=CALLED_NOW)[0]}") from None
 
     def to_dict(self) -> dict[str, Any]:
         """Inverse of `from_dict`: plain values, ready for YAML."""
@@ -181,7 +167,7 @@ class Scenario:
     def faults(self) -> dict[str, AnyFaults]:
         """The faults of the IMU and of every aiding sensor aboard, by sensor name."""
         aboard = {sensor: getattr(self, sensor) for sensor in SENSORS}
-        return {"imu": self.imu_faults} | {name: spec.faults for name, spec in aboard.items() if spec is not None}
+        return {"imu": self.imu.faults} | {name: spec.faults for name, spec in aboard.items() if spec is not None}
 
     @property
     def reach_s(self) -> tuple[float, float]:
@@ -190,25 +176,19 @@ class Scenario:
         return -max(0.0, *offsets_s), self.duration_s - min(0.0, *offsets_s)
 
     @property
-    def imu_noise(self) -> ImuNoise:
-        """The figures behind `imu`."""
-        return IMU_GRADES[self.imu] if isinstance(self.imu, str) else self.imu
-
-    @property
-    def earth_rate_radps(self) -> Array:
+    def earth_rate_rad_s(self) -> Array:
         """Angular rate of the Earth, (3,) in W axes; zero where it does not turn."""
         return np.zeros(3) if self.latitude_deg is None else self.rig.w_CW_W
 
     @property
     def rig(self) -> Rig:
         """What the estimators are told of the vehicle."""
+        aboard = {sensor: getattr(self, sensor) for sensor in ("depth", "gps", "heading")}
         return Rig(
-            imu_noise=self.imu_noise,
-            imu=self.imu_mounting.mounting(),
-            depth=self.depth_mounting.mounting(),
-            gps=self.gps_mounting.mounting(),
-            heading=self.heading_mounting.mounting(),
-            gravity=self.gravity_mps2,
+            imu_noise=self.imu.figures,
+            imu=self.imu.mounting.mounting(),
+            **{sensor: spec.mounting.mounting() for sensor, spec in aboard.items() if spec is not None},
+            gravity=self.gravity_m_s2,
             latitude_deg=self.latitude_deg,
         )
 
@@ -218,30 +198,3 @@ class Scenario:
         rig = self.rig
         stated = {"imu": rig.imu, "dvl": Mounting(), "depth": rig.depth, "gps": rig.gps, "heading": rig.heading}
         return {sensor: true_mounting(stated[sensor], faults) for sensor, faults in self.faults.items()}
-
-
-NESTED = {
-    "dvl": DvlSpec,
-    "dvl.faults": DvlFaults,
-    "depth": DepthSpec,
-    "depth.faults": DepthFaults,
-    "gps": GpsSpec,
-    "gps.faults": GpsFaults,
-    "heading": HeadingSpec,
-    "heading.faults": HeadingFaults,
-    "imu_faults": ImuFaults,
-    "seabed": SeabedSpec,
-    "waves": WavesSpec,
-    "tide": TideSpec,
-    "prior": PriorSpec,
-    "imu": ImuNoise,
-    "imu_mounting": MountingSpec,
-    "depth_mounting": MountingSpec,
-    "gps_mounting": MountingSpec,
-    "heading_mounting": MountingSpec,
-}
-
-
-def _fields_at(path: list[str]) -> list[str]:
-    """Return the keys known below a key of the scenario, or at its top."""
-    return [field.name for field in dataclasses.fields(NESTED[".".join(path)] if path else Scenario)]

@@ -31,13 +31,13 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
     if seed < 0:
         raise DatasetError(f"simulate: seed must not be negative, found {seed}")
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
-    edges_ns = np.concatenate([[0], ticks(scenario.imu_rate_hz, scenario.duration_s)])
-    biases = simulate_biases(rig.imu_noise, edges_ns, seed, scenario.imu_bias_correlation_s) * scenario.noise_scale
+    edges_ns = np.concatenate([[0], ticks(scenario.imu.rate_hz, scenario.duration_s)])
+    biases = simulate_biases(rig.imu_noise, edges_ns, seed, scenario.imu.bias_correlation_s) * scenario.noise_scale
 
     R_WB, p_WB_W, v_WB_W = motion.pose(edges_ns * 1e-9)
     truth = Trajectory(start_ns + edges_ns, R_WB, p_WB_W, v_WB_W, b_a=biases[:, :3], b_g=biases[:, 3:])
     earth = "the Earth does not turn" if scenario.latitude_deg is None else f"latitude {scenario.latitude_deg:g}°"
-    grade = scenario.imu if isinstance(scenario.imu, str) else "custom"
+    grade = scenario.imu.noise if isinstance(scenario.imu.noise, str) else "custom"
     return Log(
         name=f"{scenario.mission}-{grade}-s{seed}",
         rig=rig,
@@ -49,7 +49,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         truth=truth,
         prior=draw_prior(scenario, truth, seed),
         notes=(
-            f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu_rate_hz:g} Hz, "
+            f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu.rate_hz:g} Hz, "
             f"seed {seed}, noise scaled by {scenario.noise_scale:g}; {earth}.",
             *motion.notes,
             *told(scenario),
@@ -63,11 +63,11 @@ def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
 
     The biases' means are zero: their errors were drawn at turn-on.
     """
-    noise, prior = scenario.imu_noise, scenario.prior
+    noise, prior = scenario.imu.figures, scenario.prior
     sigma = np.empty(DIM)
     sigma[THETA] = prior.attitude_deg * DEGREE
     sigma[POSITION] = prior.position_m
-    sigma[VELOCITY] = prior.velocity_mps
+    sigma[VELOCITY] = prior.velocity_m_s
     sigma[ACCEL_BIAS] = noise.accel_bias_sigma
     sigma[GYRO_BIAS] = noise.gyro_bias_sigma
     state = truth.state(0)

@@ -1,4 +1,4 @@
-"""The parts of a scenario, as a file states them: missions, sea, mountings, sensors and the prior, each validated."""
+"""The parts of a scenario, as a file states them: missions, sea, sensors and the prior, each validated."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import dataclasses
 import math
 from typing import Annotated
 
-import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from pydantic.dataclasses import dataclass
-from scipy.spatial.transform import Rotation
 
-from ..quantities import STRICT, Finite, NotNegative, Positive, Probability, Vector
-from ..rig import Mounting
-from .faults import DepthFaults, DvlFaults, GpsFaults, HeadingFaults
+from ..errors import nearest
+from ..mounting import MountingSpec
+from ..quantities import STRICT, Finite, NotNegative, Positive, Probability
+from ..rig import ImuNoise
+from .faults import DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults
+from .imu_grades import IMU_GRADES
 
 STEEPEST = 1 / 15
 """Significant height over the length of the peak's wave: steeper seas break."""
@@ -75,17 +76,42 @@ class TideSpec:
     phase_deg: Finite = 0.0
 
 
+Noise = Annotated[
+    Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
+    Discriminator(lambda noise: "grade" if isinstance(noise, str) else "figures"),
+]
+
+
 @dataclass(frozen=True, config=STRICT)
-class MountingSpec:
-    """Where a sensor S sits: R_BS = Rz(yaw) Ry(pitch) Rx(roll), and its lever arm in B."""
+class ImuSpec:
+    """Inertial measurement unit.
 
-    roll_pitch_yaw_deg: Vector = (0.0, 0.0, 0.0)
-    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    Attributes:
+        noise: a name in IMU_GRADES, or figures of one's own.
+        bias_correlation_s: of Gauss–Markov biases; None: they walk.
+    """
 
-    def mounting(self) -> Mounting:
-        """Return it as the rig knows it."""
-        R_BS = Rotation.from_euler("xyz", self.roll_pitch_yaw_deg, degrees=True).as_matrix()
-        return Mounting(R_BS, np.array(self.lever_arm_m))
+    noise: Noise = "tactical"
+    rate_hz: Positive = 100.0
+    bias_correlation_s: Positive | None = None
+    mounting: MountingSpec = MountingSpec((-0.35, 0.05, 0.12), roll_deg=180.0, pitch_deg=2.0, yaw_deg=87.0)
+    faults: ImuFaults = ImuFaults()
+
+    @field_validator("noise")
+    @classmethod
+    def _known_grade(cls, noise: str | ImuNoise) -> str | ImuNoise:
+        if isinstance(noise, str) and noise not in IMU_GRADES:
+            raise ValueError(f"no IMU grade {noise!r}{nearest(noise, IMU_GRADES)}; known: {', '.join(IMU_GRADES)}")
+        if isinstance(noise, ImuNoise):
+            for name, value in dataclasses.asdict(noise).items():
+                if not (math.isfinite(value) and (value > 0 or (value == 0 and name.endswith("walk")))):
+                    raise ValueError(f"{name} must be positive and finite, found {value}")
+        return noise
+
+    @property
+    def figures(self) -> ImuNoise:
+        """The figures behind `noise`."""
+        return IMU_GRADES[self.noise] if isinstance(self.noise, str) else self.noise
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -93,7 +119,7 @@ class DvlSpec:
     """Four-beam Janus DVL at B. 5 mm/s per beam: Nortek DVL1000, RDI WHN600; 22.5° and 0.05–50 m: Water Linked A50."""
 
     rate_hz: Positive = 5.0
-    beam_sigma_mps: Positive = 0.005
+    beam_sigma_m_s: Positive = 0.005
     beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
     min_range_m: NotNegative = 0.05  # along each beam, where there is a seabed
     max_range_m: Positive = 50.0
@@ -113,6 +139,7 @@ class DepthSpec:
     sigma_m: Positive = 0.02
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    mounting: MountingSpec = MountingSpec((0.40, -0.06, 0.05))
     faults: DepthFaults = DepthFaults()
 
 
@@ -126,6 +153,7 @@ class GpsSpec:
     reacquisition_s: NotNegative = 0.0  # from when the antenna leaves the water to the first fix; it begins with one
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    mounting: MountingSpec = MountingSpec((-0.25, 0.0, 0.30))
     faults: GpsFaults = GpsFaults()
 
 
@@ -143,6 +171,7 @@ class HeadingSpec:
     soft_iron_axis_deg: Finite = 0.0
     delay_s: NotNegative = 0.0
     disorder_s: NotNegative = 0.0
+    mounting: MountingSpec = MountingSpec((0.55, 0.0, 0.05), roll_deg=1.5, pitch_deg=-2.0, yaw_deg=4.0)
     faults: HeadingFaults = HeadingFaults()
 
 
@@ -159,4 +188,4 @@ class PriorSpec:
 
     attitude_deg: Positive = 0.5  # each of the three axes of B
     position_m: Positive = 1.0
-    velocity_mps: Positive = 0.05
+    velocity_m_s: Positive = 0.05

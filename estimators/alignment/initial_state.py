@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from ...datasets.log import Log
-from ...datasets.rig import EARTH_RATE_RADPS
+from ...datasets.rig import EARTH_RATE_RAD_S
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, NavState, TimeArray
 from .rest import REST_M_S, mean_velocity
 from .window import Window, skew
@@ -224,7 +224,7 @@ class InitialState:
         t_ns = self._log.imu.t_ns
         w_WI_I = self._log.imu.w_WI_I[(t_ns > w.t_ns[0]) & (t_ns <= w.t_ns[-1])].mean(axis=0)
         white = self._noise.gyro_density / np.sqrt(w.length_s)
-        rows.add(EACH[GYRO], w_WI_I, np.hypot(white, EARTH_RATE_RADPS))
+        rows.add(EACH[GYRO], w_WI_I, np.hypot(white, EARTH_RATE_RAD_S))
 
     @property
     def _measured(self) -> list[bool]:

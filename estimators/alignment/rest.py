@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...datasets.log import Log
-from ...datasets.rig import EARTH_RATE_RADPS
+from ...datasets.rig import EARTH_RATE_RAD_S
 from ...datasets.state import Array, TimeArray
 from .window import heard
 
@@ -68,7 +68,7 @@ def is_quiet(log: Log, start_ns: int, end_ns: int) -> bool:
         if (means.std(axis=0, ddof=1) > SCATTER_OF_MEANS * sigma / np.sqrt(size)).any():
             return False
     rate, elapsed_s = imu.w_WI_I[inside].mean(axis=0), n * dt_s
-    sigma = np.sqrt(noise.gyro_bias_sigma**2 + EARTH_RATE_RADPS**2 + noise.gyro_density**2 / elapsed_s)
+    sigma = np.sqrt(noise.gyro_bias_sigma**2 + EARTH_RATE_RAD_S**2 + noise.gyro_density**2 / elapsed_s)
     return bool((np.abs(rate) <= SIGMAS * sigma).all())
 
 

@@ -21,7 +21,7 @@ from fathom.datasets.errors import DatasetError
 from fathom.datasets.log import ImuStream, ReadingStream
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, HeadingSpec
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, HeadingSpec, ImuSpec
 from fathom.estimators import ESTIMATORS, create
 
 SECOND = 10**9
@@ -35,7 +35,7 @@ every_fusing = pytest.mark.parametrize("name", FUSING)
 def scenario(duration_s: float) -> Scenario:
     """Slow sensors, so that many runs are short; DVL and heading speak at the same moments, and so does depth."""
     sensors = {"dvl": DvlSpec(2.0), "depth": DepthSpec(4.0), "heading": HeadingSpec(2.0)}
-    return Scenario(duration_s=duration_s, imu_rate_hz=50.0, **sensors)
+    return Scenario(duration_s=duration_s, imu=ImuSpec(rate_hz=50.0), **sensors)
 
 
 def fresh() -> Log:

@@ -27,9 +27,9 @@ from fathom.bench.errors import ExperimentError
 from fathom.bench.execution import dask_pool as cluster
 from fathom.bench.execution import dask_worker as remote
 from fathom.bench.execution.pool import Queue, log_of
-from fathom.bench.execution.sweep import run_experiment
+from fathom.bench.execution.sweep import run_experiment, sweep
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.scoring import SCORES
 from fathom.bench.results import identity as ledger
@@ -189,7 +189,7 @@ def test_a_worker_that_is_killed_costs_a_retry_and_the_rows_are_those_of_a_local
     for name in {*rows["trajectory"], *rows["truth_trajectory"]}:
         tables = [pd.read_parquet(tmp_path / where / "t" / "trajectories" / name) for where in ("cluster", "local")]
         pd.testing.assert_frame_equal(*tables, check_exact=True)
-    assert run_experiment(plan, out=tmp_path / "cluster", jobs=1).attrs["standing"] == 8  # one ledger for both
+    assert sweep(plan, out=tmp_path / "cluster", jobs=1).standing == 8  # one ledger for both
 
 
 @pytest.mark.slow
@@ -209,6 +209,7 @@ def test_a_run_that_takes_its_workers_along_is_a_failed_row_and_the_rest_is_done
     assert_nothing_is_left(client)
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_takes_the_rest_off_the_cluster(
     client: Client, scheduler: str, tmp_path: Path
 ) -> None:
@@ -236,6 +237,7 @@ def test_ctrl_c_keeps_what_is_finished_and_takes_the_rest_off_the_cluster(
     assert (finished["status"] == "done").all()
 
 
+@pytest.mark.slow
 def test_a_worker_that_computes_with_something_else_is_refused_by_name_before_anything_runs(
     client: Client, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +249,7 @@ def test_a_worker_that_computes_with_something_else_is_refused_by_name_before_an
     assert_nothing_is_left(client)
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_another_one_over_there_is_a_failed_row(
     client: Client, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,6 +260,7 @@ def test_a_recording_that_is_another_one_over_there_is_a_failed_row(
     assert "DatasetError: dive: the recording on" in rows["cause"].iloc[0]
 
 
+@pytest.mark.slow
 def test_the_command_runs_on_a_cluster_of_its_own(tmp_path: Path, site: Path) -> None:
     file = tmp_path / "e.yaml"
     file.write_text(json.dumps({"logs": [SHORT], "estimators": [{"name": "dead-reckoning"}], "seeds": 2}))
@@ -275,7 +279,7 @@ def test_the_command_runs_on_a_cluster_of_its_own(tmp_path: Path, site: Path) ->
         ("tcp://127.0.0.1:9", [], "no Dask scheduler answers within 1 s"),
         ("nowhere", [], "no Dask scheduler answers"),
         ("gone.json", [], "gone.json: not a scheduler file (FileNotFoundError"),
-        ("tcp://127.0.0.1:9", ["--jobs", "3"], "--jobs 3: how many workers there are is the affair of the cluster"),
+        ("tcp://127.0.0.1:9", ["--jobs", "3"], "--jobs 3: only for --dask local; the cluster at"),
     ],
 )
 def test_an_address_where_no_scheduler_is_gets_one_line_and_status_2(
@@ -330,7 +334,7 @@ def test_a_log_that_differs_from_the_one_planned_is_refused_and_one_that_does_no
     log = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
     folder = write_folder(log, tmp_path / "dive", "csv")
     plan = experiment(logs=[{"log": str(folder)}], estimators=[{"name": "dead-reckoning", "label": k} for k in "ab"])
-    bench = Bench()
+    bench = WorkerCache()
     first, second = (Task.of(plan, run) for run in plan.runs())
     right = content_sha256(plan.logs[0].open(None))
     assert bench.execute(replace(first, readings_sha256=right)).rows[0]["status"] == "done"
@@ -354,6 +358,7 @@ def test_recordings_are_sought_where_the_worker_has_them(tmp_path: Path, monkeyp
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_commands_have() -> None:
     page = PAGE.read_text(encoding="utf-8")
     known = {

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution import sweep as runner
 from fathom.bench.execution import worker as working
-from fathom.bench.execution.sweep import run_experiment
+from fathom.bench.execution.sweep import run_experiment, sweep
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.output.tables.table import write_table
 from fathom.bench.results import identity as ledger
@@ -41,7 +42,7 @@ def experiment(**changes: Any) -> Experiment:
 def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """What was run, by name; in this process, since what is tried here is which runs are made."""
     names: list[str] = []
-    bench = working.Bench()
+    bench = working.WorkerCache()
 
     def here(tasks: Any, jobs: int) -> Any:
         for task in tasks:
@@ -53,13 +54,13 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_what_is_done_is_not_done_again_until_forced(tmp_path: Path, ran: list[str]) -> None:
-    first = run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    first = sweep(experiment(seeds=[1, 2]), out=tmp_path)
     assert len(ran) == 2
-    assert (first.attrs["standing"], first.attrs["renewed"]) == (0, 0)
-    again = run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path)
+    assert (first.standing, first.renewed) == (0, 0)
+    again = sweep(experiment(seeds=[1, 2, 3]), out=tmp_path)
     assert ran[2:] == ["lawnmower-tactical / dead-reckoning seed 3"]
-    assert (again.attrs["standing"], again.attrs["renewed"]) == (2, 0)
-    assert again["finished"].tolist()[:2] == first["finished"].tolist()
+    assert (again.standing, again.renewed) == (2, 0)
+    assert again.rows["finished"].tolist()[:2] == first.rows["finished"].tolist()
     run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path, force=True)
     assert len(ran) == 6
     assert len(load_runs(tmp_path / "t")) == 3
@@ -68,10 +69,10 @@ def test_what_is_done_is_not_done_again_until_forced(tmp_path: Path, ran: list[s
 def test_a_changed_option_or_score_makes_a_new_run_and_says_so(tmp_path: Path, ran: list[str]) -> None:
     run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
     changed = [{"name": "dead-reckoning", "with": {"attitude": "gyro"}}]
-    rows = run_experiment(experiment(seeds=[1, 2], estimators=changed), out=tmp_path)
-    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 2)
-    rows = run_experiment(experiment(seeds=[1, 2], estimators=changed, scores={"rpe_delta": 2.0}), out=tmp_path)
-    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 2)
+    outcome = sweep(experiment(seeds=[1, 2], estimators=changed), out=tmp_path)
+    assert (outcome.standing, outcome.renewed) == (0, 2)
+    outcome = sweep(experiment(seeds=[1, 2], estimators=changed, scores={"rpe_delta": 2.0}), out=tmp_path)
+    assert (outcome.standing, outcome.renewed) == (0, 2)
     assert len(load_runs(tmp_path / "t")) == 2
     assert len(ran) == 6
 
@@ -84,7 +85,7 @@ def test_another_version_or_other_code_makes_new_runs(
     for name in ("numpy", "code"):
         changed = there | {name: "other"}
         monkeypatch.setattr(ledger, "versions", lambda changed=changed: changed)
-        assert run_experiment(experiment(), out=tmp_path).attrs["renewed"] == 1
+        assert sweep(experiment(), out=tmp_path).renewed == 1
     assert len(ran) == 3
 
 
@@ -93,10 +94,10 @@ def test_a_recorded_log_whose_readings_have_changed_is_another_log(tmp_path: Pat
     folder = write_folder(log, tmp_path / "a", "csv")
     plan = experiment(logs=[{"log": str(folder)}])
     run_experiment(plan, out=tmp_path / "out")
-    assert run_experiment(plan, out=tmp_path / "out").attrs["standing"] == 1
+    assert sweep(plan, out=tmp_path / "out").standing == 1
     lines = (folder / "depth.csv").read_text().splitlines()
     (folder / "depth.csv").write_text("\n".join(lines[:-1]) + "\n")
-    assert run_experiment(plan, out=tmp_path / "out").attrs["renewed"] == 1
+    assert sweep(plan, out=tmp_path / "out").renewed == 1
     assert len(ran) == 2
 
 
@@ -141,20 +142,53 @@ def test_another_recorded_path_under_the_same_name_is_another_log(tmp_path: Path
     truth.to_tum(tmp_path / "path.tum")
     first = run_experiment(plan, out=tmp_path / "out")
     assert first["status"].tolist() == ["done"]
-    assert run_experiment(plan, out=tmp_path / "out").attrs["standing"] == 1
+    assert sweep(plan, out=tmp_path / "out").standing == 1
     replace(truth, p_WB_W=1.1 * truth.p_WB_W).to_tum(tmp_path / "path.tum")
-    again = run_experiment(plan, out=tmp_path / "out")
-    assert again.attrs["renewed"] == 1
-    assert again["identity"].tolist() != first["identity"].tolist()
+    again = sweep(plan, out=tmp_path / "out")
+    assert again.renewed == 1
+    assert again.rows["identity"].tolist() != first["identity"].tolist()
 
 
-def test_rows_of_an_older_version_are_renewed_and_counted(tmp_path: Path, ran: list[str]) -> None:
+def test_a_store_of_another_version_is_refused_before_anything_runs(tmp_path: Path, ran: list[str]) -> None:
     run_experiment(experiment(), out=tmp_path)
     with closing(sqlite3.connect(tmp_path / "t" / "runs.sqlite")) as store, store:
         store.execute("ALTER TABLE runs DROP COLUMN identity")
-    rows = run_experiment(experiment(), out=tmp_path)
-    assert (rows.attrs["standing"], rows.attrs["renewed"]) == (0, 1)
-    assert len(load_runs(tmp_path / "t")) == 1
+    with pytest.raises(ExperimentError, match=r"another version wrote it: it lacks column identity; .* move it away"):
+        run_experiment(experiment(), out=tmp_path)
+    assert len(ran) == 1
+
+
+def test_the_log_with_the_least_work_goes_first_and_its_rows_are_told_when_its_last_run_has_ended(
+    tmp_path: Path, ran: list[str]
+) -> None:
+    logs = [
+        {"name": name, "scenario": {"duration_s": s}} for name, s in (("long", 400), ("middle", 200), ("short", 20))
+    ]
+    told: list[tuple[int, pd.DataFrame]] = []
+    outcome = sweep(
+        experiment(logs=logs, seeds=[1, 2]), out=tmp_path, finished_log=lambda rows: told.append((len(ran), rows))
+    )
+    assert [name.split(" ")[0] for name in ran] == ["short", "short", "long", "long", "middle", "middle"]
+    assert [(done, set(rows["log"])) for done, rows in told] == [(2, {"short"}), (4, {"long"}), (6, {"middle"})]
+    in_order = [told[k][1] for k in (1, 2, 0)]
+    assert pd.concat(in_order)["identity"].tolist() == outcome.rows["identity"].tolist()
+
+
+def test_logs_of_like_work_run_the_longest_first(tmp_path: Path, ran: list[str]) -> None:
+    logs = [{"name": str(s), "scenario": {"duration_s": s}} for s in (30, 20, 40)]
+    run_experiment(experiment(logs=logs), out=tmp_path)
+    assert [name.split(" ")[0] for name in ran] == ["40", "30", "20"]
+
+
+def test_progress_goes_to_a_log_file_by_lines(
+    tmp_path: Path, ran: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runner, "LINE_EVERY_S", -1.0)
+    run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    assert capsys.readouterr().err.splitlines()[-2:] == [
+        "1 of 2 runs finished; the last: lawnmower-tactical / dead-reckoning: done",
+        "2 of 2 runs finished; the last: lawnmower-tactical / dead-reckoning: done",
+    ]
 
 
 def test_a_full_disk_does_not_keep_the_lock_from_holding(tmp_path: Path) -> None:
@@ -188,10 +222,9 @@ def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
 KILLED = """
 import json, os, random, signal, sqlite3, sys, time
 from contextlib import closing
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
+from multiprocessing import Pipe, get_context
 from pathlib import Path
-from fathom.bench import runner, task, workers, working
+from fathom.bench.execution import pool, sweep, task, worker
 from fathom.bench.experiment.plan import Experiment
 
 plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
@@ -199,18 +232,22 @@ plan, out, kills = Experiment.from_dict(json.loads(sys.argv[1])), Path(sys.argv[
 
 class Forked:
     # a worker's process as the child of a warm one, which starts at once
-    stdin = None
 
-    def __init__(self, descriptor):
-        theirs = Connection(os.dup(descriptor))
-        self.process = get_context("fork").Process(target=working.work, args=(theirs,), daemon=True)
+    def __init__(self, target):
+        self.connection, theirs = Pipe()
+        self.process = get_context("fork").Process(target=worker.work, args=(theirs,), daemon=True)
         self.process.start()
-        self.kill, self.wait = self.process.kill, self.process.join
+        theirs.close()
+
+    def kill(self):
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
 
 
-workers.start = Forked
+pool.start = Forked
 for run in plan.runs()[:2]:
-    working.Bench().execute(task.Task.of(plan, run))
+    worker.WorkerCache().execute(task.Task.of(plan, run))
 
 
 def held():
@@ -227,7 +264,7 @@ for _ in range(kills):
     child = os.fork()
     if child == 0:
         os.setsid()
-        runner.run_experiment(plan, out=out, jobs=2)
+        sweep.run_experiment(plan, out=out, jobs=2)
         os._exit(0)
     if longest_s is None:  # how long is a moment on this machine, as busy as it is
         while len(held()) < 6:

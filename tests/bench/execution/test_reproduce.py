@@ -17,7 +17,7 @@ from fathom.bench.execution import sweep as runner
 from fathom.bench.execution.reproduce import compare, rebuild, reproduce_all
 from fathom.bench.execution.sweep import run_experiment
 from fathom.bench.execution.task import Finished, Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.floor import floors
 from fathom.bench.results import identity as ledger
@@ -51,7 +51,7 @@ def call(*arguments: object) -> tuple[int, str, str]:
 
 
 def within_this_process(tasks: Sequence[Task], jobs: int = 0) -> Generator[Finished]:
-    bench = Bench()
+    bench = WorkerCache()
     bench.warm = {repr(task.run.estimator.create()) for task in tasks}
     for task in tasks:
         yield bench.execute(task)

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
 import gc
+import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from fathom.bench.execution.drive import run_log, score_ticks, warm_up
 from fathom.bench.execution.result import costs, innovation_dof, innovation_scores
+from fathom.bench.execution.task import parquet
 from fathom.bench.metrics.scoring import COSTS, INNOVATIONS, SCORES, Scoring, scores
 from fathom.datasets import Belief, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import Epoch
@@ -450,3 +453,13 @@ def test_being_judged_changes_nothing_of_what_is_said(name: str, readings: dict[
         assert track.P is not None
         assert again.P is not None
         assert np.allclose(again.P, track.P, rtol=1e-9, atol=1e-15, equal_nan=True)
+
+
+def test_a_trajectory_is_kept_with_the_blocks_of_its_covariance(log: Log) -> None:
+    online = run_log(log, create("eskf")).online
+    assert online is not None
+    kept, whole = pd.read_parquet(io.BytesIO(parquet(online))), online.to_pandas()
+    blocks = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15) if i // 3 == j // 3]
+    assert list(kept) == [name for name in whole if not name.startswith("P_") or name in blocks]
+    assert set(kept[blocks].dtypes) == {np.dtype("float32")}
+    pd.testing.assert_frame_equal(kept, whole[list(kept)].astype(dict.fromkeys(blocks, "float32")), check_exact=True)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +11,7 @@ import pandas as pd
 import pytest
 from fathom.bench.execution.drive import run_log
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment, LogSpec
 from fathom.bench.output.tables.table import write_table
 from fathom.bench.results.store import COLUMNS, Store
@@ -51,7 +49,7 @@ def test_a_run_is_stored_with_its_start(tmp_path: Path, monkeypatch: pytest.Monk
     plan = Experiment.from_dict(PLAN)
     with Store(tmp_path / "runs.sqlite") as store:
         for run in plan.runs():
-            store.write(Bench().execute(Task.of(plan, run)).keep(tmp_path))
+            store.write(WorkerCache().execute(Task.of(plan, run)).keep(tmp_path))
         rows = store.read()
     start = "given" if prior == "given" else "moving, heading unknown"
     assert rows["status"].tolist() == ["done"]
@@ -69,14 +67,11 @@ def test_seeds_that_start_otherwise_are_all_named() -> None:
     assert summary["start"] == "static | moving"
 
 
-def test_a_store_from_before_has_no_start(tmp_path: Path) -> None:
-    older = {name: kind for name, kind in COLUMNS.items() if name != "start"}
-    with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as connection, connection:
-        connection.execute(f"CREATE TABLE runs ({', '.join(f'{name} {kind}' for name, kind in older.items())})")
-        connection.execute(
-            "INSERT INTO runs (experiment, log, label, output, status) VALUES ('e', 'l', 'a', 'o', 'done')"
-        )
+def test_a_run_that_never_began_has_no_start(tmp_path: Path) -> None:
     with Store(tmp_path / "runs.sqlite") as store:
+        store.write(
+            [{"experiment": "e", "log": "l", "label": "a", "seed": None, "output": "online", "status": "failed"}]
+        )
         rows = store.read()
         assert rows["start"].isna().tolist() == [True]
         assert summarise(rows)[0]["start"] is None

@@ -11,7 +11,7 @@ import pytest
 from fathom.bench.cli.app import app
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.comparison import Comparison
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.experiment.variants import changed, named_axes, points
@@ -105,10 +105,10 @@ def test_every_point_of_a_grid_has_its_own_drops() -> None:
 
 
 def test_a_log_has_a_grid_over_its_scenario() -> None:
-    grid = {"gps.faults.outages_s": {"calm": [], "out": [[3, 9]]}, "speed_mps": [1, 2]}
+    grid = {"gps.faults.outages_s": {"calm": [], "out": [[3, 9]]}, "speed_m_s": [1, 2]}
     plan = experiment(logs=[{"name": "l", "scenario": SHORT | {"gps": {"rate_hz": 2}}, "grid": grid}])
-    assert [log.name for log in plan.logs] == [f"l {words} speed_mps={v}" for words in ("calm", "out") for v in (1, 2)]
-    assert plan.logs[3].scenario == SHORT | {"gps": {"rate_hz": 2, "faults": {"outages_s": [[3, 9]]}}, "speed_mps": 2}
+    assert [log.name for log in plan.logs] == [f"l {words} speed_m_s={v}" for words in ("calm", "out") for v in (1, 2)]
+    assert plan.logs[3].scenario == SHORT | {"gps": {"rate_hz": 2, "faults": {"outages_s": [[3, 9]]}}, "speed_m_s": 2}
     assert plan.spec(plan.runs()[-1])["log"]["gps"]["faults"]["outages_s"] == [[3.0, 9.0]]
 
 
@@ -120,7 +120,7 @@ def test_changing_a_nested_value_leaves_the_original_alone() -> None:
 
 def test_variants_survive_being_written_out_again() -> None:
     plan = experiment(estimators=[{"name": "eskf", "drop": ["gps"], "grid": {"max_delay_s": [0, 1]}}])
-    again = Experiment("t", plan.logs, plan.estimators)
+    again = Experiment(name="t", logs=plan.logs, estimators=plan.estimators)
     assert again.estimators == plan.estimators
     assert again.comparisons() == plan.comparisons()
 
@@ -157,7 +157,7 @@ def test_what_is_wrong_with_an_estimators_variants_is_named(changes: dict[str, A
         ({"baseline": "lwanmower-tactical"}, ["no log has the name", "did you mean 'lawnmower-tactical'"]),
         ({"estimators": ["esfk"]}, ["lawnmower-tactical: estimators", "did you mean 'eskf'"]),
         ({"estimators": []}, ["logs[0].estimators", "at least 1"]),
-        ({"log": "x", "scenario": None, "grid": {"speed_mps": [1]}}, ["logs[0]", "`grid` is for simulated logs"]),
+        ({"log": "x", "scenario": None, "grid": {"speed_m_s": [1]}}, ["logs[0]", "`grid` is for simulated logs"]),
         ({"log": "x", "scenario": None, "baseline": "x"}, ["logs[0]", "`baseline` is for simulated logs"]),
     ],
 )
@@ -211,11 +211,11 @@ def test_without_a_baseline_nothing_is_compared() -> None:
 
 def test_a_log_is_compared_with_its_baseline_estimator_by_estimator() -> None:
     plan = experiment(
-        logs=[{"name": "l", "scenario": SHORT, "grid": {"speed_mps": [1, 2]}, "baseline": "l speed_mps=1"}],
+        logs=[{"name": "l", "scenario": SHORT, "grid": {"speed_m_s": [1, 2]}, "baseline": "l speed_m_s=1"}],
         estimators=[{"name": "eskf"}, {"name": "iekf"}],
     )
     assert plan.comparisons() == [
-        Comparison("l speed_mps=2", label, "l speed_mps=1", label) for label in ("eskf", "iekf")
+        Comparison("l speed_m_s=2", label, "l speed_m_s=1", label) for label in ("eskf", "iekf")
     ]
 
 
@@ -295,7 +295,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out")
     (out / "small.yaml").write_text(str(PLAN).replace("'", '"'))  # JSON is YAML
     with pytest.MonkeyPatch.context() as patch:
-        bench = Bench()
+        bench = WorkerCache()
         patch.setattr(
             "fathom.bench.execution.sweep.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks)
         )
@@ -367,7 +367,7 @@ def test_the_figure_is_vectors_and_a_legible_png(differences: list[dict[str, Any
 
 
 def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench = Bench()
+    bench = WorkerCache()
     monkeypatch.setattr(
         "fathom.bench.execution.sweep.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks)
     )

@@ -120,7 +120,7 @@ def test_a_number_of_seeds_counts_from_one() -> None:
 
 @pytest.mark.parametrize("seeds", [0, -1, 10**6, "three", True, 2.0])
 def test_seeds_that_are_neither_a_list_nor_a_number_of_them_are_refused(seeds: object) -> None:
-    with pytest.raises(ExperimentError, match="seeds: expected a list of seeds, or how many"):
+    with pytest.raises(ExperimentError, match="`seeds`: expected a list of seeds, or how many"):
         experiment(seeds=seeds)
 
 
@@ -129,7 +129,7 @@ def test_the_spec_of_a_run_holds_every_default_and_is_json() -> None:
     spec = json.loads(json.dumps(plan.spec(plan.runs()[0])))
     assert spec["estimator"]["config"]["factors"] == ["depth", "dvl", "heading"]
     assert spec["log"]["duration_s"] == 20.0
-    assert spec["log"]["gravity_mps2"] == 9.81
+    assert spec["log"]["gravity_m_s2"] == 9.81
     assert spec["seed"] == 1
     assert (spec["repair"], spec["log_sha256"]) == (False, None)
 
@@ -150,7 +150,7 @@ def test_the_spec_of_a_recorded_run_knows_its_description_and_whether_it_was_rep
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"sedes": [1]}, ["sedes: unknown key 'sedes'", "did you mean 'seeds'"]),
+        ({"sedes": [1]}, ["unknown key `sedes`", "did you mean 'seeds'"]),
         ({"logs": [SHORT | {"aline": "yaw"}]}, ["logs[0].aline", "did you mean 'align'"]),
         ({"estimators": [{"name": "eskf", "wiht": {}}]}, ["estimators[0].wiht", "did you mean 'with'"]),
         ({"estimators": [{"name": "esfk"}]}, ["estimators[0]", "no estimator 'esfk'", "did you mean 'eskf'"]),
@@ -306,9 +306,9 @@ def test_what_is_in_the_way_of_results_is_named_before_anything_runs(tmp_path: P
 def test_a_worker_is_out_of_reach_of_ctrl_c_from_its_first_moment() -> None:
     worker = Worker()
     try:
-        assert os.getpgid(worker.process.pid) == worker.process.pid != os.getpgid(0)
+        assert os.getpgid(worker.child.process.pid) == worker.child.process.pid != os.getpgid(0)
     finally:
-        worker.kill()
+        worker.child.kill()
 
 
 ORPHANED = """
@@ -322,7 +322,7 @@ estimator = {"name": "mishap", "with": {"kind": "hangs"}}
 plan = Experiment.from_dict({"name": "t", "logs": [log], "estimators": [estimator]})
 worker = Worker()
 worker.begin(Task.of(plan, plan.runs()[0]))
-print(worker.process.pid, flush=True)
+print(worker.child.process.pid, flush=True)
 time.sleep(3600)
 """
 
@@ -346,7 +346,7 @@ def test_a_worker_whose_parent_is_gone_ends_in_silence(monkeypatch: pytest.Monke
         def send(self, rows: object) -> None:
             raise BrokenPipeError
 
-    monkeypatch.setattr("fathom.bench.execution.worker.Bench.execute", lambda bench, task: [])
+    monkeypatch.setattr("fathom.bench.execution.worker.WorkerCache.execute", lambda bench, task: [])
     work(Gone())
 
 

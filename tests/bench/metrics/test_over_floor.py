@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from fathom.bench.execution.drive import run_log
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics import ScoreError
 from fathom.bench.metrics.floor import floors
@@ -48,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def rows(folder: Path) -> pd.DataFrame:
-    plan, bench = Experiment.from_dict(PLAN), Bench()
+    plan, bench = Experiment.from_dict(PLAN), WorkerCache()
     found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).keep(folder)]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS))
 
@@ -77,20 +77,20 @@ def test_over_the_floor_squares_are_pooled_over_seeds(rows: pd.DataFrame) -> Non
 
 def test_without_being_asked_for_there_is_no_floor(folder: Path) -> None:
     plan = Experiment.from_dict(PLAN | {"scores": {}, "seeds": [2]})
-    found = Bench().execute(Task.of(plan, plan.runs()[0])).rows
+    found = WorkerCache().execute(Task.of(plan, plan.runs()[0])).rows
     assert found[0]["floor_position_m"] is None
     assert summarise(pd.DataFrame(found).reindex(columns=list(COLUMNS)))[0]["over_floor_position"] is None
 
 
 def test_without_noise_there_is_no_floor_to_stand_on_and_no_harm_done(folder: Path) -> None:
     plan = Experiment.from_dict(PLAN | {"logs": [{"scenario": SCENARIO | {"noise_scale": 0}}], "seeds": [2]})
-    found = Bench().execute(Task.of(plan, plan.runs()[0])).rows
+    found = WorkerCache().execute(Task.of(plan, plan.runs()[0])).rows
     assert found[0]["floor_position_m"] == 0.0
     assert summarise(pd.DataFrame(found).reindex(columns=list(COLUMNS)))[0]["over_floor_position"] is None
 
 
 def test_a_floor_that_cannot_be_found_leaves_the_run_its_scores(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan, bench = Experiment.from_dict(PLAN | {"seeds": [2]}), Bench()
+    plan, bench = Experiment.from_dict(PLAN | {"seeds": [2]}), WorkerCache()
 
     def refuse(*_: object) -> None:
         raise ScoreError("floor: no such look-ahead")

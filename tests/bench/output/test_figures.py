@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.scoring import SCORES
 from fathom.bench.output.figures.consistency import draw_nees
@@ -48,7 +48,7 @@ def rows(folder: Path) -> pd.DataFrame:
             "seeds": [2],
         }
     )
-    bench = Bench()
+    bench = WorkerCache()
     found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).keep(folder)]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS))
 
@@ -203,7 +203,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path
             "scores": {"nis": True, "nees_epochs": 6},
         }
     )
-    bench = Bench()
+    bench = WorkerCache()
     found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).keep(folder)]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
 

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from fathom.bench.execution.sweep import Outcome
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.output.present import present, print_log
 from fathom.bench.results.store import Store, load_runs
@@ -34,7 +34,7 @@ def plan() -> Experiment:
 @pytest.fixture(scope="module")
 def folder(plan: Experiment, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with the runs of two logs, in the order in which they might finish."""
-    folder, bench = tmp_path_factory.mktemp("p"), Bench()
+    folder, bench = tmp_path_factory.mktemp("p"), WorkerCache()
     (folder / "trajectories").mkdir()
     with Store(folder / "runs.sqlite") as store:
         for run in reversed(plan.runs()):

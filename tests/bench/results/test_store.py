@@ -75,32 +75,34 @@ def test_what_was_written_is_there_when_the_writer_is_killed(tmp_path: Path) -> 
     assert len(load_runs(tmp_path)) == 1
 
 
-def test_a_store_of_an_older_version_gains_columns_and_keeps_rows(tmp_path: Path) -> None:
-    with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as old, old:
-        old.execute("CREATE TABLE runs (experiment TEXT, log TEXT, label TEXT, seed INTEGER, output TEXT, status TEXT)")
-        old.execute("INSERT INTO runs VALUES ('e', 'l', 'old', 1, 'online', 'done')")
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("DROP COLUMN drms_m", "lacks column drms_m"),
+        ("ADD COLUMN anees_position", "has an unknown column anees_position"),
+    ],
+)
+def test_a_store_of_other_columns_is_refused_with_what_to_do_and_left_alone(
+    tmp_path: Path, change: str, says: str
+) -> None:
+    file = tmp_path / "runs.sqlite"
+    with Store(file) as store:
+        store.write([row()])
+    with closing(sqlite3.connect(file)) as other, other:
+        other.execute(f"ALTER TABLE runs {change}")
+    for use in (lambda: Store(file), lambda: load_runs(tmp_path)):
+        with pytest.raises(ExperimentError, match=f"another version wrote it: it {says}; .* move it away and run"):
+            use()
+    with closing(sqlite3.connect(file)) as other:
+        assert other.execute("SELECT count(*) FROM runs").fetchone() == (1,)
+
+
+def test_the_rows_of_one_log_can_be_read_alone(tmp_path: Path) -> None:
     with Store(tmp_path / "runs.sqlite") as store:
         store.write([row()])
-        table = store.read()
-    assert table["label"].tolist() == ["old", "eskf"]
-    assert table["ate_rmse_m"].isna().tolist() == [True, False]
-
-
-def test_an_older_store_is_read_with_what_it_calls_otherwise_or_lacks(tmp_path: Path) -> None:
-    with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as old, old:
-        columns = "experiment TEXT, log TEXT, label TEXT, seed INTEGER, output TEXT, status TEXT, anees_position REAL"
-        old.execute(f"CREATE TABLE runs ({columns})")
-        old.execute("INSERT INTO runs VALUES ('e', 'l', 'old', 1, 'online', 'done', 2.5)")
-    table = load_runs(tmp_path)  # read only: nothing is renamed
-    assert list(table.columns) == list(COLUMNS)
-    assert table["nees_position"].isna().all()
-    with Store(tmp_path / "runs.sqlite") as store:
-        store.write([row(nis_dvl=1.25, nis_dof='{"dvl": 900}', nees_at='{"t_s": [1.0]}')])
-    table = load_runs(tmp_path)
-    assert table["nees_position"].tolist()[0] == 2.5
-    assert table["nis_dvl"].tolist()[1] == 1.25
-    assert table["nees_at"].tolist()[1] == '{"t_s": [1.0]}'
-    assert table["nis_dof"].isna().tolist() == [True, False]
+        store.write([row(log="m")])
+        assert store.read("m")["log"].tolist() == ["m"]
+        assert store.read()["log"].tolist() == ["l", "m"]
 
 
 def test_a_file_that_is_no_store_is_refused_and_left_alone(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from fathom.bench.cli.app import app
 from fathom.bench.execution.task import Task
-from fathom.bench.execution.worker import Bench
+from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.results.store import COLUMNS
 from fathom.bench.timing.cost import BEGIN, END, LAGS_S, cost_markdown, cost_records, draw_accuracy_cost, write_cost
@@ -37,7 +37,7 @@ def rows() -> pd.DataFrame:
             "seeds": [1, 2],
         }
     )
-    bench = Bench()
+    bench = WorkerCache()
     found = [row for run in plan.runs() for row in bench.execute(Task.of(plan, run)).rows]
     return pd.DataFrame(found).reindex(columns=list(COLUMNS))
 
@@ -118,9 +118,9 @@ def test_the_readme_shows_the_table_that_the_command_makes() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--profile", "eskff"], "no estimator 'eskff'"),
-        (["--profile", "eskf", "-o", "{file}"], "cannot be made"),
-        (["--cost", "-o", "{file}"], "cannot be made"),
+        (["profile", "eskff"], "no estimator 'eskff'"),
+        (["profile", "eskf", "-o", "{file}"], "cannot be made"),
+        (["cost", "-o", "{file}"], "cannot be made"),
     ],
 )
 def test_what_cannot_be_profiled_or_written_is_refused_in_one_line(
@@ -139,7 +139,7 @@ def test_a_run_does_not_hide_in_the_memory_that_the_run_before_left() -> None:
     plan = Experiment.from_dict(
         {"name": "m", "logs": [{"scenario": {"duration_s": 60}}], "estimators": [{"name": "isam2"}], "seeds": [1]}
     )
-    bench, task = Bench(), Task.of(plan, plan.runs()[0])
+    bench, task = WorkerCache(), Task.of(plan, plan.runs()[0])
     first, again = (bench.execute(task).rows[0]["peak_mb"] for _ in range(2))
     assert first > 5  # a graph of 300 keyframes with 15 × 15 blocks
     assert again > 0.5 * first

@@ -82,7 +82,7 @@ def test_the_experiment_may_say_who_trains_and_the_command_line_overrules_it(tmp
             Sides(("sim",), ("box",)),
             "sim/1 trains and box/1 is held out: the same random numbers",
         ),
-        ({"tune": {"held_uot": ["x"]}}, Sides(), "unknown key 'held_uot'; did you mean 'held_out'"),
+        ({"tune": {"held_uot": ["x"]}}, Sides(), "unknown key `tune.held_uot`; did you mean 'held_out'"),
     ],
 )
 def test_no_log_is_on_both_sides_and_none_is_empty(

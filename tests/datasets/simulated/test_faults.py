@@ -7,27 +7,29 @@ import numpy as np
 import pytest
 from fathom.datasets import DatasetError, Log
 from fathom.datasets.epochs import cut
+from fathom.datasets.mounting import MountingSpec
 from fathom.datasets.simulated.faults import DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults
 from fathom.datasets.simulated.missions import fly
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, MountingSpec
+from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, ImuSpec
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 SENSORS = ("dvl", "depth", "gps", "heading")
 SPEC = {"dvl": DvlSpec, "depth": DepthSpec, "gps": GpsSpec, "heading": HeadingSpec}
 FAULTS = {"dvl": DvlFaults, "depth": DepthFaults, "gps": GpsFaults, "heading": HeadingFaults}
-OUTLIER = {"dvl": "outlier_mps", "depth": "outlier_m", "gps": "outlier_m", "heading": "outlier_deg"}
-ALWAYS_AFLOAT = MountingSpec(lever_arm_m=(-0.25, 0.1, 50.0))
+OUTLIER = {"dvl": "outlier_m_s", "depth": "outlier_m", "gps": "outlier_m", "heading": "outlier_deg"}
+ALWAYS_AFLOAT = MountingSpec((-0.25, 0.1, 50.0))
 
 
 def with_faults(sensor: str | None, noise_scale: float = 1.0, duration_s: float = 120, **faults) -> Log:
     """A log whose sensors all read at 10 Hz, with faults of one of them."""
     values = {s: SPEC[s](rate_hz=10, faults=FAULTS[s](**(faults if s == sensor else {}))) for s in SENSORS}
     if sensor == "imu":
-        values["imu_faults"] = ImuFaults(**faults)
-    return simulate(Scenario(duration_s=duration_s, noise_scale=noise_scale, gps_mounting=ALWAYS_AFLOAT, **values), 11)
+        values["imu"] = ImuSpec(faults=ImuFaults(**faults))
+    values["gps"] = dataclasses.replace(values["gps"], mounting=ALWAYS_AFLOAT)
+    return simulate(Scenario(duration_s=duration_s, noise_scale=noise_scale, **values), 11)
 
 
 def imu_and(log: Log, sensor: str) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +110,7 @@ def test_outliers_have_the_stated_share_and_size(sensor):
 
 
 def test_imu_outliers_have_the_stated_share_and_sizes():
-    log = with_faults("imu", outlier_probability=0.05, gyro_outlier_dps=10, accel_outlier_mps2=3)
+    log = with_faults("imu", outlier_probability=0.05, gyro_outlier_deg_s=10, accel_outlier_m_s2=3)
     error = imu_and(log, "imu")[1] - imu_and(clean(), "imu")[1]
     hit = np.abs(error).max(axis=1) > 1e-9
     low, high = binom.interval(0.999, len(hit), 0.05)
@@ -225,13 +227,15 @@ def test_an_imu_off_its_place_feels_its_own_point_and_axes():
     """The simulator of another rig, stated right, is the oracle."""
     base = Scenario(duration_s=30, noise_scale=0.0)
     faulty = simulate(
-        dataclasses.replace(base, imu_faults=ImuFaults(lever_arm_error_m=ARM, misalignment_deg=(0.5, 1.0, -2.0))), 3
+        dataclasses.replace(
+            base, imu=ImuSpec(faults=ImuFaults(lever_arm_error_m=ARM, misalignment_deg=(0.5, 1.0, -2.0)))
+        ),
+        3,
     )
     R_BI = base.rig.imu.R_BS @ Rotation.from_euler("ZYX", [-2.0, 1.0, 0.5], degrees=True).as_matrix()
-    really = MountingSpec(
-        tuple(Rotation.from_matrix(R_BI).as_euler("xyz", degrees=True)), tuple(base.rig.imu.p_BS_B + ARM)
-    )
-    oracle = simulate(dataclasses.replace(base, imu_mounting=really), 3)
+    yaw_deg, pitch_deg, roll_deg = Rotation.from_matrix(R_BI).as_euler("ZYX", degrees=True)
+    really = MountingSpec(tuple(base.rig.imu.p_BS_B + ARM), roll_deg, pitch_deg, yaw_deg)
+    oracle = simulate(dataclasses.replace(base, imu=ImuSpec(mounting=really)), 3)
     np.testing.assert_allclose(faulty.imu.f_I, oracle.imu.f_I, atol=1e-9)
     np.testing.assert_allclose(faulty.imu.w_WI_I, oracle.imu.w_WI_I, atol=1e-9)
     assert np.array_equal(faulty.rig.imu.R_BS, base.rig.imu.R_BS)
@@ -265,7 +269,7 @@ def test_imu_scale_is_one_per_axis():
     assert_only(log, clean(), "imu")
 
 
-@pytest.mark.parametrize(("sensor", "dial", "limit"), [("dvl", "limit_mps", 1.4), ("depth", "limit_m", 8.0)])
+@pytest.mark.parametrize(("sensor", "dial", "limit"), [("dvl", "limit_m_s", 1.4), ("depth", "limit_m", 8.0)])
 def test_a_saturated_sensor_stays_at_its_limit(sensor, dial, limit):
     log = with_faults(sensor, **{dial: limit})
     assert np.array_equal(log.streams[sensor].z, np.clip(clean().streams[sensor].z, -limit, limit))
@@ -274,23 +278,23 @@ def test_a_saturated_sensor_stays_at_its_limit(sensor, dial, limit):
 
 
 def test_the_imu_saturates_axis_by_axis():
-    log = with_faults("imu", gyro_limit_dps=4.0, accel_limit_mps2=9.8)
+    log = with_faults("imu", gyro_limit_deg_s=4.0, accel_limit_m_s2=9.8)
     limit = np.repeat([9.8, np.radians(4.0)], 3)
     samples = imu_and(clean(), "imu")[1]
     assert np.array_equal(imu_and(log, "imu")[1], np.clip(samples, -limit, limit))
     assert (np.abs(samples) > limit).any(axis=0)[[2, 3, 4, 5]].all()
-    alone = with_faults("imu", gyro_limit_dps=4.0)
+    alone = with_faults("imu", gyro_limit_deg_s=4.0)
     assert np.array_equal(alone.imu.f_I, clean().imu.f_I)
 
 
 @pytest.mark.parametrize(
     ("sensor", "dials", "step"),
     [
-        ("dvl", {"quantum_mps": 0.01}, 0.01),
+        ("dvl", {"quantum_m_s": 0.01}, 0.01),
         ("depth", {"quantum_m": 0.05}, 0.05),
         ("gps", {"quantum_m": 0.5}, 0.5),
         ("heading", {"quantum_deg": 1.0}, np.radians(1.0)),
-        ("imu", {"gyro_quantum_dps": 0.02, "accel_quantum_mps2": 0.01}, np.repeat([0.01, np.radians(0.02)], 3)),
+        ("imu", {"gyro_quantum_deg_s": 0.02, "accel_quantum_m_s2": 0.01}, np.repeat([0.01, np.radians(0.02)], 3)),
     ],
 )
 def test_quantised_readings_are_the_nearest_multiples(sensor, dials, step):
@@ -304,7 +308,7 @@ def test_quantised_readings_are_the_nearest_multiples(sensor, dials, step):
 
 
 def test_outliers_are_clipped_and_rounded_like_any_reading():
-    log = with_faults("dvl", outlier_probability=0.5, outlier_mps=10, limit_mps=3.0, quantum_mps=0.25)
+    log = with_faults("dvl", outlier_probability=0.5, outlier_m_s=10, limit_m_s=3.0, quantum_m_s=0.25)
     assert np.abs(log.dvl.z).max() == 3.0
     np.testing.assert_array_equal(log.dvl.z, np.rint(log.dvl.z * 4) / 4)
 
@@ -313,7 +317,7 @@ def test_outliers_are_clipped_and_rounded_like_any_reading():
 
 
 EVERYTHING = {
-    "imu_faults": {"dropout_probability": 0.02, "gyro_limit_dps": 5, "clock_offset_s": 0.01},
+    "imu": {"faults": {"dropout_probability": 0.02, "gyro_limit_deg_s": 5, "clock_offset_s": 0.01}},
     "dvl": {"delay_s": 0.1, "faults": {"outlier_probability": 0.05, "scale": 1.01, "outages_s": [[20, 30]]}},
     "depth": {"faults": {"repeat_probability": 0.1, "quantum_m": 0.002}},
     "gps": {"faults": {"outages_s": [[0, 5], [100, 120]], "lever_arm_error_m": [0.1, 0, 0]}},
@@ -325,8 +329,8 @@ def test_a_log_with_every_kind_of_fault_can_be_cut_and_is_told():
     log = simulate(Scenario.from_dict({"duration_s": 120, **EVERYTHING}), 2)
     assert cut(log).failure is None
     assert list(log.notes[3:]) == [
-        "imu faults: dropout_probability 0.02, clock_offset_s 0.01, gyro_limit_dps 5.",
-        "dvl faults: outages_s [[20, 30]], outlier_probability 0.05, scale 1.01, outlier_mps 1.",
+        "imu faults: dropout_probability 0.02, clock_offset_s 0.01, gyro_limit_deg_s 5.",
+        "dvl faults: outages_s [[20, 30]], outlier_probability 0.05, scale 1.01, outlier_m_s 1.",
         "depth faults: repeat_probability 0.1, quantum_m 0.002.",
         "gps faults: outages_s [[0, 5], [100, 120]], lever_arm_error_m [0.1, 0, 0].",
         "heading faults: clock_offset_s -0.1, misalignment_deg [0, 0, 2].",
@@ -347,12 +351,12 @@ def test_faulty_scenarios_survive_a_file():
     [
         ({"dvl": {"faults": {"dropout_probabilty": 0.1}}}, ["dvl.faults.dropout_probabilty", "'dropout_probability'"]),
         ({"dvl": {"fault": {}}}, ["dvl.fault", "did you mean 'faults'"]),
-        ({"depth": {"faults": {"outlier_mps": 1}}}, ["depth.faults.outlier_mps", "did you mean 'outlier_m'"]),
+        ({"depth": {"faults": {"outlier_m_s": 1}}}, ["depth.faults.outlier_m_s", "did you mean 'outlier_m'"]),
         ({"gps": {"faults": {"dropout_probability": 1.5}}}, ["gps.faults.dropout_probability", "less than", "1.5"]),
-        ({"gps": {"faults": {"outages_s": [[20, 10]]}}}, ["gps.faults.outages_s.0", "[20.0, 10.0]"]),
-        ({"gps": {"faults": {"outages_s": [[-1, 10]]}}}, ["gps.faults.outages_s.0"]),
+        ({"gps": {"faults": {"outages_s": [[20, 10]]}}}, ["gps.faults.outages_s[0]", "[20.0, 10.0]"]),
+        ({"gps": {"faults": {"outages_s": [[-1, 10]]}}}, ["gps.faults.outages_s[0]"]),
         ({"heading": {"faults": {"clock_offset_s": 60}}}, ["heading.faults.clock_offset_s", "60"]),
-        ({"imu_faults": {"gyro_scale": 1.01}}, ["imu_faults.gyro_scale"]),
+        ({"imu": {"faults": {"gyro_scale": 1.01}}}, ["imu.faults.gyro_scale"]),
         ({"dvl": {"faults": {"scale": 0}}}, ["dvl.faults.scale", "greater than 0"]),
     ],
 )
@@ -364,7 +368,7 @@ def test_a_bad_fault_is_refused_by_name(values, words):
 
 
 def test_a_recorded_path_must_last_for_wrong_clocks_too():
-    path = simulate(Scenario(duration_s=60, imu_rate_hz=5), 1).truth
+    path = simulate(Scenario(duration_s=60, imu=ImuSpec(rate_hz=5)), 1).truth
     spec = DvlSpec(faults=DvlFaults(clock_offset_s=0.5))
     scenario = Scenario(mission="recorded", duration_s=60, dvl=spec)
     with pytest.raises(DatasetError, match=r"the scenario needs it from -0\.5 to 60 s"):

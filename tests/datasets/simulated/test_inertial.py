@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from fathom.datasets import ImuNoise, Log, Trajectory
+from fathom.datasets.mounting import MountingSpec
 from fathom.datasets.simulated.imu import simulate_biases, simulate_white_noise
 from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.missions import fly
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import MISSIONS, MountingSpec, TideSpec, WavesSpec
+from fathom.datasets.simulated.specs import MISSIONS, ImuSpec, TideSpec, WavesSpec
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -91,7 +92,7 @@ def mechanise(log: Log, w_WB_B: np.ndarray, earth_rate_W: np.ndarray | None = No
 
 def assert_returns(scenario: Scenario, seed: int, path: Trajectory | None = None) -> None:
     log = simulate(scenario, seed, path)
-    R_WB, p_WB_W = mechanise(log, fly(scenario, seed, path).attitude(np.zeros(1))[1][0], scenario.earth_rate_radps)
+    R_WB, p_WB_W = mechanise(log, fly(scenario, seed, path).attitude(np.zeros(1))[1][0], scenario.earth_rate_rad_s)
     assert np.linalg.norm(p_WB_W - log.truth.p_WB_W, axis=1).max() < 5e-3
     assert Rotation.from_matrix(R_WB[-1].T @ log.truth.R_WB[-1]).magnitude() < 1e-7
     assert np.ptp(log.truth.p_WB_W, axis=0).max() > 15  # it had been somewhere
@@ -108,7 +109,7 @@ def test_free_inertial_navigation_returns_within_5_mm_after_10_minutes(mission, 
 
 @pytest.mark.slow
 def test_free_inertial_navigation_along_a_recorded_path_returns_within_5_mm():
-    flown = simulate(Scenario(mission="yo-yo", duration_s=620, imu_rate_hz=5), 2).truth
+    flown = simulate(Scenario(mission="yo-yo", duration_s=620, imu=ImuSpec(rate_hz=5)), 2).truth
     assert_returns(Scenario(mission="recorded", path_start_s=9, **TEN_MINUTES), 0, flown)
 
 
@@ -117,7 +118,7 @@ def test_free_inertial_navigation_along_a_recorded_path_returns_within_5_mm():
 def test_free_inertial_navigation_through_waves_and_tide_returns_within_5_mm(mission):
     """At 200 Hz: at 100 Hz the mechanisation's own error, which goes with the cube of the interval, is 5 mm."""
     sea = {"waves": WavesSpec(height_m=1.0, period_s=5.0, towards_deg=200), "tide": TideSpec(amplitude_m=2)}
-    assert_returns(Scenario(mission=mission, imu_rate_hz=200, **TEN_MINUTES, **sea), 1)
+    assert_returns(Scenario(mission=mission, imu=ImuSpec(rate_hz=200), **TEN_MINUTES, **sea), 1)
 
 
 @pytest.mark.parametrize("latitude_deg", [50.0, -20.0])
@@ -145,7 +146,7 @@ def test_a_gyro_on_a_turning_earth_sees_15_degrees_an_hour():
 
 
 def test_coriolis_pushes_an_accelerometer_by_twice_its_velocity_across_the_earths_rate():
-    scenario = Scenario(duration_s=60, noise_scale=0.0, imu_mounting=MountingSpec(lever_arm_m=(2.0, 0, 0)))
+    scenario = Scenario(duration_s=60, noise_scale=0.0, imu=ImuSpec(mounting=MountingSpec((2.0, 0, 0))))
     still, turning = (simulate(dataclasses.replace(scenario, latitude_deg=x), 1) for x in (None, 90.0))
     motion, h, t_s = fly(scenario, 1), 1e-4, (np.arange(6000) + 0.5) * 0.01
 
@@ -161,7 +162,7 @@ def test_coriolis_pushes_an_accelerometer_by_twice_its_velocity_across_the_earth
 
 
 def test_a_level_imu_at_rest_feels_gravity_upwards():
-    scenario = Scenario(noise_scale=0.0, wobble_deg=0.0, duration_s=20, imu_mounting=MountingSpec())
+    scenario = Scenario(noise_scale=0.0, wobble_deg=0.0, duration_s=20, imu=ImuSpec(mounting=MountingSpec()))
     f_B = simulate(scenario, 0).imu.f_I[0]
     np.testing.assert_allclose(f_B, [0, 0, 9.81], atol=0.05)
 
@@ -284,7 +285,7 @@ def test_gauss_markov_biases_with_a_long_memory_walk():
 
 
 def test_the_logs_truth_holds_the_gauss_markov_biases():
-    log = simulate(Scenario(duration_s=30, imu=STILL, imu_bias_correlation_s=5.0), 3)
+    log = simulate(Scenario(duration_s=30, imu=ImuSpec(STILL, bias_correlation_s=5.0)), 3)
     expected = simulate_biases(STILL, np.arange(3001) * 10_000_000, 3, 5.0)
     assert np.array_equal(np.hstack([log.truth.b_a, log.truth.b_g]), expected)
     assert "imu biases: Gauss–Markov, correlated over 5 s." in log.notes

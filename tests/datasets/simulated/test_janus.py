@@ -113,7 +113,7 @@ def test_lost_beams_leave_the_stated_shares():
 def test_three_beams_give_the_velocity_with_sigmas_root_two_larger():
     """By hand, along the opposite pair u = (b1 − b2) / 2s and c w = −(b1 + b2) / 2; the third beam gives the other axis
     with 3 / 2s². Turned by 45°: 1 / s² for x and for y, and 1 / 2c² for z."""
-    dials = {"beam_sigma_mps": 0.01, "beam_angle_deg": 30, "beam_loss_probability": 0.2, "rate_hz": 50}
+    dials = {"beam_sigma_m_s": 0.01, "beam_angle_deg": 30, "beam_loss_probability": 0.2, "rate_hz": 50}
     noisy, quiet, whole = log_of(**dials), log_of(0.0, **dials), log_of(**dials | {"beam_loss_probability": 0})
     three = noisy.dvl.sigma[:, 0] > 0.019
     np.testing.assert_allclose(

@@ -76,8 +76,8 @@ def test_starts_and_ends_afloat_and_dives_between(mission, duration_s):
     assert z_m.max() < AFLOAT_M + 1e-3
     assert z_m.min() < AFLOAT_M - min(15.0, 0.04 * duration_s)
     assert z_m.min() > AFLOAT_M - 20.01
-    speed_mps = np.linalg.norm(motion.velocity(t_s), axis=1)
-    assert 1.4 < speed_mps.min() < speed_mps.max() < 1.6
+    speed_m_s = np.linalg.norm(motion.velocity(t_s), axis=1)
+    assert 1.4 < speed_m_s.min() < speed_m_s.max() < 1.6
 
 
 @every_mission

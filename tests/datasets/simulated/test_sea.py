@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from fathom.datasets import DatasetError
+from fathom.datasets.mounting import MountingSpec
 from fathom.datasets.simulated.missions import fly
 from fathom.datasets.simulated.motion import AFLOAT_M
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.sea import Sea
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import DepthSpec, GpsSpec, HeadingSpec, MountingSpec, TideSpec, WavesSpec
+from fathom.datasets.simulated.specs import DepthSpec, GpsSpec, HeadingSpec, ImuSpec, TideSpec, WavesSpec
 from scipy.spatial.transform import Rotation
 
 WAVES = WavesSpec(height_m=1.0, period_s=6.0, towards_deg=130.0)
@@ -54,18 +55,18 @@ def test_waves_have_the_height_and_the_energy_period_of_their_spectrum():
     eta = sea.rise_m(t_s, np.zeros((len(t_s), 3)))
     assert 4 * np.std(eta) == pytest.approx(1.0, rel=0.02)
     # m₋₁ / m₀ of a Bretschneider spectrum is 0.857 of its peak's period
-    assert np.mean(2 * np.pi / sea.frequency_radps) == pytest.approx(0.857 * 6.0, rel=0.01)
-    assert np.mean(sea.frequency_radps < 2 * np.pi / 6.0) == pytest.approx(np.exp(-1.25), abs=1 / 16)
+    assert np.mean(2 * np.pi / sea.frequency_rad_s) == pytest.approx(0.857 * 6.0, rel=0.01)
+    assert np.mean(sea.frequency_rad_s < 2 * np.pi / 6.0) == pytest.approx(np.exp(-1.25), abs=1 / 16)
 
 
 def test_waves_run_where_they_are_said_to():
     """Seen from a point that runs along with the longest wave, that wave stands still."""
     sea = sea_of()
-    i = int(np.argmin(sea.frequency_radps))
+    i = int(np.argmin(sea.frequency_rad_s))
     lone = Sea(
-        *(x[i : i + 1] for x in (sea.amplitude_m, sea.frequency_radps, sea.phase_rad)), sea.direction, 9.81, None
+        *(x[i : i + 1] for x in (sea.amplitude_m, sea.frequency_rad_s, sea.phase_rad)), sea.direction, 9.81, None
     )
-    t_s, celerity = np.linspace(0, 60, 50), 9.81 / sea.frequency_radps[i]
+    t_s, celerity = np.linspace(0, 60, 50), 9.81 / sea.frequency_rad_s[i]
     towards = np.array([np.cos(np.radians(130)), np.sin(np.radians(130)), 0])
     assert np.ptp(lone.rise_m(t_s, celerity * np.outer(t_s, towards))) < 1e-9
     assert np.ptp(lone.rise_m(t_s, -celerity * np.outer(t_s, towards))) > 0.1
@@ -107,7 +108,7 @@ def test_heave_fades_with_depth_as_each_wave_does():
     t_s = np.arange(200, 5800, 0.5)
     heave_m = fly(rough, 1).position(t_s)[:, 2] - fly(calm, 1).position(t_s)[:, 2]
     sea = sea_of()
-    k = sea.frequency_radps**2 / 9.81
+    k = sea.frequency_rad_s**2 / 9.81
     expected = np.sqrt(np.mean(np.exp(-2 * k * 8.1))) / 4
     assert np.std(heave_m) == pytest.approx(expected, rel=0.05)
     assert expected < 0.6 / 4
@@ -117,9 +118,9 @@ def test_a_leaning_vehicle_feels_no_force_sideways():
     """It lies on surfaces of equal pressure, and floats: what it feels is square to them (all but its own way)."""
     side = {}
     for towards in (30, 120):
-        values = {"mission": "transit", "wobble_deg": 0, "duration_s": 300, "surface_for_s": 300, "speed_mps": 0.02}
+        values = {"mission": "transit", "wobble_deg": 0, "duration_s": 300, "surface_for_s": 300, "speed_m_s": 0.02}
         rough = Scenario(noise_scale=0, waves=WavesSpec(height_m=0.3, towards_deg=towards), **values)
-        log = simulate(Scenario.from_dict(rough.to_dict() | {"imu_mounting": {}}), 1)
+        log = simulate(Scenario.from_dict(rough.to_dict() | {"imu": {"mounting": {}}}), 1)
         afloat = slice(0, 6000)
         slope = sea_of(rough.waves).slope(log.truth.t_ns[afloat] * 1e-9, log.truth.p_WB_W[afloat])
         side[towards] = np.std(log.imu.f_I[afloat, :2], axis=0) / (9.81 * np.std(np.linalg.norm(slope, axis=1)))
@@ -161,7 +162,7 @@ def test_tide_carries_the_vehicle_and_is_not_seen_by_its_depth_sensor():
 
 
 def test_a_tide_over_a_recorded_path_shows_in_the_depth_alone():
-    path = simulate(Scenario(duration_s=60, imu_rate_hz=5), 1).truth
+    path = simulate(Scenario(duration_s=60, imu=ImuSpec(rate_hz=5)), 1).truth
     base = {"mission": "recorded", "duration_s": 60, "noise_scale": 0.0, "gps": None}
     plain, tidal = (simulate(Scenario(**base, tide=x), 1, path) for x in (None, TideSpec(period_h=1.0)))
     assert np.array_equal(plain.truth.p_WB_W, tidal.truth.p_WB_W)
@@ -175,8 +176,8 @@ def antenna_above_m(log, sea: Sea | None) -> np.ndarray:
 
 
 def test_gps_is_heard_while_the_antenna_is_above_the_waves():
-    low = MountingSpec(lever_arm_m=(-0.25, 0.0, 0.06))
-    steep = Scenario(duration_s=300, waves=WavesSpec(height_m=1.5), gps=GpsSpec(rate_hz=10), gps_mounting=low)
+    low = MountingSpec((-0.25, 0.0, 0.06))
+    steep = Scenario(duration_s=300, waves=WavesSpec(height_m=1.5), gps=GpsSpec(rate_hz=10, mounting=low))
     log = simulate(steep, 1)
     afloat = antenna_above_m(log, sea_of(steep.waves))[10::10] > -0.05
     assert np.array_equal(log.gps.t_ns, log.truth.t_ns[10::10][afloat])

@@ -10,6 +10,7 @@ import yaml
 from fathom.datasets import DatasetError, ImuNoise, Log, open_log
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.epochs import cut
+from fathom.datasets.mounting import MountingSpec
 from fathom.datasets.simulated.imu import simulate_biases
 from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.random_streams import RANDOM_STREAMS, random_stream
@@ -22,7 +23,7 @@ from fathom.datasets.simulated.specs import (
     DvlSpec,
     GpsSpec,
     HeadingSpec,
-    MountingSpec,
+    ImuSpec,
     PriorSpec,
     TideSpec,
     WavesSpec,
@@ -99,9 +100,9 @@ def test_gps_is_heard_only_at_the_surface(mission):
 
 
 def test_dvl_sigma_is_that_of_its_beams():
-    log = simulate(Scenario(duration_s=600, dvl=DvlSpec(rate_hz=50, beam_sigma_mps=0.01, beam_angle_deg=30)), 1)
+    log = simulate(Scenario(duration_s=600, dvl=DvlSpec(rate_hz=50, beam_sigma_m_s=0.01, beam_angle_deg=30)), 1)
     quiet = simulate(
-        Scenario(duration_s=600, dvl=DvlSpec(rate_hz=50, beam_sigma_mps=0.01, beam_angle_deg=30), noise_scale=0), 1
+        Scenario(duration_s=600, dvl=DvlSpec(rate_hz=50, beam_sigma_m_s=0.01, beam_angle_deg=30), noise_scale=0), 1
     )
     # by hand: two opposite beams give v_x with 1/(2 sin) of their difference; turned by 45° all four share in each
     np.testing.assert_allclose(log.dvl.sigma[0], 0.01 * np.array([2**0.5, 2**0.5, 1 / 3**0.5]), rtol=1e-12)
@@ -113,7 +114,7 @@ def test_dvl_sigma_is_that_of_its_beams():
 
 
 def test_readings_have_the_sigmas_they_state():
-    scenario = Scenario(duration_s=600, gps_mounting=MountingSpec(lever_arm_m=(0, 0, 50)))  # GPS all the time
+    scenario = Scenario(duration_s=600, gps=GpsSpec(mounting=MountingSpec((0, 0, 50))))  # GPS all the time
     noisy, quiet = simulate(scenario, 4), simulate(dataclasses.replace(scenario, noise_scale=0.0), 4)
     for name in SENSORS:
         error = noisy.streams[name].z - quiet.streams[name].z
@@ -155,11 +156,12 @@ def test_disorder_lets_readings_overtake_one_another_and_moves_nothing_else():
     assert np.array_equal(mixed.dvl.received_ns, prompt.dvl.received_ns)
 
 
+@pytest.mark.slow
 def test_prior_error_has_the_covariance_it_states():
     seeds = range(200)
     errors, nees = [], []
     for seed in seeds:
-        log = simulate(Scenario(duration_s=20, imu_rate_hz=5, prior=PriorSpec(attitude_deg=2)), seed)
+        log = simulate(Scenario(duration_s=20, imu=ImuSpec(rate_hz=5), prior=PriorSpec(attitude_deg=2)), seed)
         assert not log.prior.state.b_a.any()
         assert not log.prior.state.b_g.any()
         errors.append(log.prior.state.local(log.truth.state(0)) / np.sqrt(np.diag(log.prior.P)))
@@ -188,8 +190,10 @@ EVERYTHING = {
     "waves": {"height_m": 0.8},
     "tide": {},
     "seabed": {"relief_m": 2},
-    "imu_bias_correlation_s": 100,
-    "imu_faults": {"dropout_probability": 0.01, "outlier_probability": 0.01, "gyro_quantum_dps": 0.01},
+    "imu": {
+        "bias_correlation_s": 100,
+        "faults": {"dropout_probability": 0.01, "outlier_probability": 0.01, "gyro_quantum_deg_s": 0.01},
+    },
     "dvl": {"beam_loss_probability": 0.1, "max_tilt_deg": 15, "delay_s": 0.2, "faults": {"repeat_probability": 0.1}},
     "gps": {"reacquisition_s": 5, "faults": {"outages_s": [[3, 6]]}},
     "heading": {"soft_iron_deg": 2, "disorder_s": 1, "faults": {"clock_offset_s": 0.05}},
@@ -211,7 +215,7 @@ def test_a_log_with_everything_in_it_is_fixed_by_its_seed_can_be_cut_and_survive
 def test_dropping_or_changing_one_sensor_changes_no_other(sensor):
     base = Scenario(duration_s=60)
     other_spec = {
-        "dvl": DvlSpec(beam_sigma_mps=0.02, rate_hz=7),
+        "dvl": DvlSpec(beam_sigma_m_s=0.02, rate_hz=7),
         "depth": DepthSpec(sigma_m=0.1),
         "gps": GpsSpec(rate_hz=2),
         "heading": HeadingSpec(bias_deg=5),
@@ -303,14 +307,20 @@ def test_the_page_on_the_simulator_shows_every_dial_at_its_default():
         ({"mision": "yo-yo"}, ["mision", "did you mean 'mission'"]),
         ({"mission": "lawnmover"}, ["mission", "did you mean 'lawnmower'"]),
         ({"imu": "tacticel"}, ["imu", "did you mean 'tactical'"]),
-        ({"imu_rate_hz": -100}, ["imu_rate_hz", "greater than 0", "-100"]),
+        ({"imu": {"rate_hz": -100}}, ["`imu.rate_hz`", "greater than 0", "-100"]),
         ({"dvl": {"rate": 5}}, ["dvl.rate", "did you mean 'rate_hz'"]),
         ({"dvl": {"rate_hz": 0}}, ["dvl.rate_hz", "greater than 0"]),
         ({"duration_s": 5}, ["duration_s", "20"]),
         ({"duration_s": float("nan")}, ["duration_s"]),
-        ({"speed_mps": float("inf")}, ["speed_mps", "finite"]),
-        ({"imu_mounting": {"lever_arm": [0, 0, 0]}}, ["imu_mounting.lever_arm", "did you mean 'lever_arm_m'"]),
-        ({"imu": {"gyro_densty": 1e-4}}, ["imu.gyro_densty", "did you mean 'gyro_density'"]),
+        ({"speed_m_s": float("inf")}, ["speed_m_s", "finite"]),
+        ({"imu": {"mounting": {"yaw": 3}}}, ["imu.mounting.yaw", "did you mean 'yaw_deg'"]),
+        ({"imu": {"noise": {"gyro_densty": 1e-4}}}, ["imu.noise.gyro_densty", "did you mean 'gyro_density'"]),
+        ({"speed_mps": 1.5}, ["`speed_mps` is called `speed_m_s` now"]),
+        ({"dvl": {"faults": {"limit_mps": 3}}}, ["`dvl.faults.limit_mps` is called `limit_m_s` now"]),
+        ({"imu_rate_hz": 50}, ["`imu_rate_hz` is called `imu.rate_hz` now"]),
+        ({"gps_mounting": {}}, ["`gps_mounting` is called `gps.mounting` now"]),
+        ({"imu": {"mounting": {"lever_arm_m": [0, 0, 0]}}}, ["lever_arm_m` is called `translation_m` now"]),
+        ({"imu": {"gyro_density": 1e-4}}, ["`imu.gyro_density` is called `noise.gyro_density` now"]),
         ({"imu": 3}, ["imu"]),
         ({"mission": "yo-yo", "depth_m": 3}, ["shallow_m", "less than"]),
         ({"mission": "helix", "helix_pitch_m": 70}, ["helix_pitch_m 70", "45°"]),

@@ -9,9 +9,10 @@ import pytest
 from fathom.datasets import ImuNoise, Log, Mounting, Rig
 from fathom.datasets.epochs import cut
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream
+from fathom.datasets.mounting import MountingSpec
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import GpsSpec, HeadingSpec, MountingSpec
+from fathom.datasets.simulated.specs import GpsSpec, HeadingSpec
 from fathom.datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, NavState
 from fathom.datasets.trajectory import Trajectory
 from fathom.estimators.alignment.initial_state import second_order
@@ -330,7 +331,7 @@ def test_a_vehicle_that_gathers_way_is_level_where_a_dvl_sees_it():
 
 def test_the_track_lays_itself_onto_the_fixes_with_its_lever_arm():
     dials = {"heading": None, "noise_scale": 0.0, "mission": "box", "leg_m": 6.0, "turn_radius_m": 4.0}
-    log = afloat(8, gps_mounting=MountingSpec(lever_arm_m=(2.0, 1.0, 0.5)), **dials)
+    log = afloat(8, gps=replace(AFLOAT.gps, mounting=MountingSpec((2.0, 1.0, 0.5))), **dials)
     error, P, start = error_of(log)
     assert start == "moving, heading by GPS"
     assert np.sqrt(P[2, 2]) < np.radians(5.0)
@@ -351,7 +352,7 @@ def test_fixes_that_do_not_fit_the_track_are_believed_less():
         assert made.start == "moving, heading unknown"
 
 
-@pytest.mark.parametrize(("dials", "start"), [({"speed_mps": 0.05}, "moving"), ({"gps": None}, "moving")])
+@pytest.mark.parametrize(("dials", "start"), [({"speed_m_s": 0.05}, "moving"), ({"gps": None}, "moving")])
 def test_without_a_track_under_gps_the_heading_is_unknown(dials, start):
     made = initialise(afloat(10, heading=None, **dials))
     assert made.start == f"{start}, heading unknown"

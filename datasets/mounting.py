@@ -1,0 +1,46 @@
+"""The part `mounting` of a log.yaml and of a scenario: the pose of a sensor on the vehicle."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import model_validator
+from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import Rotation
+
+from .quantities import STRICT, Finite, Vector
+from .rig import Mounting
+
+Matrix = tuple[Vector, Vector, Vector]
+
+
+@dataclass(frozen=True, config=STRICT)
+class MountingSpec:
+    """Pose of a sensor's axes S on the body's (forward-left-up): R_BS = Rz(yaw) Ry(pitch) Rx(roll), and its lever arm.
+
+    Attributes:
+        translation_m: p_BS_B.
+        R_BS: the rotation itself, by rows, in place of the angles.
+    """
+
+    translation_m: Vector = (0.0, 0.0, 0.0)
+    roll_deg: Finite = 0.0
+    pitch_deg: Finite = 0.0
+    yaw_deg: Finite = 0.0
+    R_BS: Matrix | None = None
+
+    @model_validator(mode="after")
+    def _is_a_mounting(self) -> MountingSpec:
+        if self.R_BS is not None and (self.roll_deg or self.pitch_deg or self.yaw_deg):
+            raise ValueError("give R_BS or the angles, not both")
+        self.mounting()
+        return self
+
+    def mounting(self) -> Mounting:
+        """Return the mounting as the rig holds it."""
+        p_BS_B = np.array(self.translation_m)
+        if self.R_BS is not None:
+            return Mounting(np.array(self.R_BS), p_BS_B)
+        angles_deg = [self.yaw_deg, self.pitch_deg, self.roll_deg]
+        if not any(angles_deg):
+            return Mounting(np.eye(3), p_BS_B)
+        return Mounting(Rotation.from_euler("ZYX", angles_deg, degrees=True).as_matrix(), p_BS_B)
