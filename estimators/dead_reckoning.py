@@ -68,8 +68,7 @@ class DeadReckoningPass:
             )
             self._p_WB_W = self._p_WB_W + self._R_WB @ displacement["dp"][0]
             if self._config.attitude == "gyro":
-                for sample in imu:
-                    self._R_WB = self._R_WB @ exp(self._rig.imu.R_BS @ (sample["w_WI_I"] - rate_bias) * sample["dt_s"])
+                self._R_WB = self._R_WB @ displacement["dR"][0]
         for reading in epoch.readings:
             self._take(reading)
         self._t_ns = epoch.t_ns

@@ -35,7 +35,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -46,8 +45,11 @@ from ...datasets.simulated.simulator import simulate
 from ...datasets.state import DIM, LIMIT_NS, VELOCITY, Array, TimeArray
 from ...datasets.trajectory import Trajectory
 from ...estimators.interface import FACTORS
-from ...estimators.physics.imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise
-from ...estimators.physics.measurements import decorrelate, measure
+from ...estimators.physics.compiled import compiled
+from ...estimators.physics.elimination import add_scaled, decorrelate, project
+from ...estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise, sandwich
+from ...estimators.physics.measurements import measure
+from ...estimators.physics.state import STATE
 from .association import ScoreError
 from .pose_error import rotation_vector
 
@@ -229,48 +231,46 @@ def last_complete(line: Line, now_ns: TimeArray) -> NDArray[np.int64]:
     return np.searchsorted(line.stop, missing, side="right") - 1
 
 
-# -- compiled; calls nothing of another file, a change in which numba's cache would not see ---------------------------
+# -- compiled ---------------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
-def subtract(A: Array, a: Array, b: Array) -> None:
-    """A ← A − a bᵀ."""
-    for i in range(len(a)):
-        for j in range(len(b)):
-            A[i, j] -= a[i] * b[j]
+@compiled
+def subtract(A: Array, a: Array, scale: float, b: Array) -> None:
+    """A ← A − scale a bᵀ, for fifteen components."""
+    for i in range(DIM):
+        add_scaled(A[i], -scale * a[i], b)
 
 
-@njit(cache=True)
+@compiled
 def take_in(P: Array, first: int, last: int, line: Line, now_ns: int, k: Array, S: Array) -> None:
     """Carry P, in place, from moment `first` to `last` with what has been received by now_ns; fill k and S of its rows.
 
     A row that is still to come has no gain and an infinite S.
     """
     for j in range(first + 1, last + 1):
-        carried = line.F[j] @ P @ line.F[j].T
-        P[:] = 0.5 * (carried + carried.T) + line.Q[j]
+        sandwich(line.F[j], P, line.Q[j], P)
         for row in range(line.stop[j - 1], line.stop[j]):
             if line.received_ns[row] > now_ns:
                 k[row], S[row] = 0.0, np.inf
                 continue
-            Ph = P @ line.h[row]
-            S[row] = line.h[row] @ Ph + line.c[row]
-            k[row] = Ph / S[row]
-            subtract(P, Ph, k[row])
+            S[row] = project(line.h[row], P, line.c[row], k[row])
+            subtract(P, k[row], 1.0 / S[row], k[row])
+            for i in range(DIM):
+                k[row, i] /= S[row]
 
 
-@njit(cache=True)
+@compiled
 def learn(P_t: Array, B: Array, first: int, last: int, line: Line, k: Array, S: Array) -> None:
     """Take from P_t, in place, what the rows after moment `first` tell of it up to `last`; carry B along."""
     for j in range(first + 1, last + 1):
         B[:] = B @ line.F[j].T
         for row in range(line.stop[j - 1], line.stop[j]):
             d = B @ line.h[row]
-            subtract(P_t, d, d / S[row])
-            subtract(B, d, k[row])
+            subtract(P_t, d, 1.0 / S[row], d)
+            subtract(B, d, 1.0, k[row])
 
 
-@njit(cache=True)
+@compiled
 def look_ahead(
     out: Array, tick: NDArray[np.int64], now_ns: TimeArray, complete: NDArray[np.int64], last: NDArray[np.int64],
     line: Line, P: Array, k: Array, S: Array,
@@ -301,7 +301,7 @@ def look_ahead(
             out[a, lag] = P_lag
 
 
-@njit(cache=True)
+@compiled
 def look_back(P: Array, tick: NDArray[np.int64], line: Line, k: Array, S: Array) -> None:
     """Turn P (ticks, 15, 15), in place, from what was known at the ticks into what the whole log tells of them."""
     L, a = np.zeros((DIM, DIM)), len(tick) - 1
@@ -311,7 +311,7 @@ def look_back(P: Array, tick: NDArray[np.int64], line: Line, k: Array, S: Array)
             a -= 1
         for row in range(line.stop[j] - 1, line.stop[j - 1] - 1, -1):
             h, Lk = line.h[row], L @ k[row]
-            subtract(L, h, Lk - (1.0 / S[row] + k[row] @ Lk) * h)
-            subtract(L, Lk, h)
+            subtract(L, h, 1.0, Lk - (1.0 / S[row] + k[row] @ Lk) * h)
+            subtract(L, Lk, 1.0, h)
         carried = line.F[j].T @ L @ line.F[j]
         L[:] = 0.5 * (carried + carried.T)

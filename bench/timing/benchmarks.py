@@ -1,9 +1,9 @@
 """What is timed: small pieces of real work, by name and group.
 
-`pytest tests/bench/timing` times these, `fathom timing --against REV` compares them with those of another revision.
-There this file is loaded into the packages of both revisions, so both do the same work. It therefore asks them for what
-others rely on (DESIGN, section 10) wherever it can, and for anything only inside of a benchmark: a revision that lacks
-it lacks that benchmark alone. Logs and stores are written once, by `write_inputs`, and read by both.
+`pytest tests/bench/timing` times these. `fathom timing against REV` compares them with those of another revision: it
+loads this file into the packages of both revisions, so both do the same work. The modules of a revision may lie
+elsewhere. So a benchmark uses the public names (DESIGN, section 10) wherever it can, and imports within its function: a
+revision that lacks a name lacks that benchmark only. `write_inputs` writes logs and stores once; both read them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Work:
 
     Attributes:
         do: the work; the same each time.
-        units: how many samples, keyframes, poses, ... that is.
+        units: number of samples, keyframes, poses, ... in it.
     """
 
     do: Callable[[], object]
@@ -36,10 +36,10 @@ class Benchmark:
 
     Attributes:
         name: unique.
-        group: what it is a part of.
-        unit: what its time is told by.
+        group: part of the package that it times.
+        unit: its time is given per this.
         prepare: makes it ready, given the folder that `write_inputs` filled; not timed.
-        short: the short comparison has it, too.
+        short: whether it belongs to the short comparison.
     """
 
     name: str
@@ -76,8 +76,7 @@ def write_inputs(folder: Path, chosen: Iterable[Benchmark]) -> None:
     """Write the logs, the track and, for the report, the store of runs that these benchmarks read."""
     from ...datasets import Scenario, simulate
     from ...datasets.described.folder import write_folder
-    from ..execution.sweep import run_experiment
-    from ..experiment.plan import Experiment
+    from .. import Experiment, run_experiment
 
     for name, scenario in SCENARIOS.items():
         log = simulate(Scenario.from_dict(scenario), seed=4)
@@ -98,7 +97,7 @@ def _log(folder: Path, name: str) -> Any:
 
 @cache
 def _tracks() -> tuple[Any, Any]:
-    """Return a random walk of POSES poses at 10 Hz, and an estimate of it that errs."""
+    """Return a random walk of POSES poses at 10 Hz, and an estimate of it with errors."""
     import numpy as np
     from scipy.spatial.transform import Rotation
 
@@ -130,11 +129,11 @@ def _steps(
     """Begin a pass, take every step of a log, or of its first seconds, and finish."""
     from ...datasets.epochs import cut
     from ...estimators import create
-    from ..execution.drive import score_ticks
 
     log = _log(folder, log_name)
     estimator = create(name, **options)
-    epochs = cut(log, score_ticks(log, 1.0), estimator.factors if sensors is None else sensors).epochs
+    ticks = log.imu.t_ns[99::100]  # one a second, as in a run
+    epochs = cut(log, ticks, estimator.factors if sensors is None else sensors).epochs
     epochs = [epoch for epoch in epochs if epoch.t_ns - log.start_ns <= first_s * 1e9]
 
     def do() -> Any:
@@ -216,10 +215,11 @@ def _simulation(folder: Path) -> Work:
 
 
 def _score(folder: Path, name: str, **options: Any) -> Work:
-    from .. import metrics
+    from ... import bench
 
     truth, estimate = _tracks()
-    return Work(lambda: getattr(metrics, name)(truth, estimate, **options), POSES)
+    score = getattr(bench, name)
+    return Work(lambda: score(truth, estimate, **options), POSES)
 
 
 def _loading(folder: Path, name: str) -> Work:
@@ -236,8 +236,7 @@ def _tum(folder: Path) -> Work:
 
 def _harness(folder: Path) -> Work:
     from ...estimators import create
-    from ..execution.drive import run_log
-    from ..metrics.scoring import scores
+    from .. import run_log, scores
 
     log, estimator = _log(folder, "minute"), create("dead-reckoning", attitude="heading")
 

@@ -1,66 +1,48 @@
-"""The budgets of DESIGN, section 8: ratios, each measured within one command, the two sides taking turns.
+"""A budget is a number that must not be exceeded, or not be fallen short of; `fathom timing budgets` measures them.
 
-Where both sides are one thread of ours, processor time is compared, so that a busy machine does not matter much.
+Nearly all are ratios, both sides measured within one command and taking turns. Where both sides are one thread of ours,
+processor time is compared, so that a busy machine does not matter much. The rows stand in `budget_rows`.
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, partial
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from rich.text import Text
 
-from ...datasets import Log, Scenario, simulate
-from ...datasets.described.folder import write_folder
-from ...datasets.epochs import cut
-from ...estimators import create
-from ..execution.drive import run_log, score_ticks, warm_up
-from ..execution.pool import run_all
-from ..execution.result import Result
-from ..execution.task import Task
-from ..experiment.plan import Experiment
-from ..metrics import ate
-from ..metrics.scoring import scores
-from . import evo
-
-LAGS_S = (3.0, 10.0, 30.0)
-CHEAPER = ({}, {"wildfire": 0.1}, {"wildfire": 0.1, "relinearize": [0.05, 1e3, 0.5, 10.0]})
-"""Settings of `fls`, each cheaper than the one before."""
-
-RUNS, WARM_RUNS = 100, 10
+from ..output.tables.terminal import console
+from .printing import COLOUR, progress, save, select
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Ratios, one per round, and what is to be said of them."""
+    """Numbers, one per round, and a remark on them."""
 
-    ratios: tuple[float, ...]
+    values: tuple[float, ...]
     note: str = ""
 
     @property
     def median(self) -> float:
-        """What counts."""
-        return float(np.median(self.ratios))
+        """The number that is compared with the limit."""
+        return float(np.median(self.values))
 
 
 @dataclass(frozen=True)
 class Budget:
-    """One row of section 8.
+    """One row of section 8 of the design.
 
     Attributes:
-        name: what over what.
-        limit: the ratio that is asked for.
+        name: what is measured, over what.
+        limit: the number asked for.
         least: whether it is the least allowed (else the most).
         measure: measures it.
-        obstacle: what stands in the way, where it is known to be missed.
+        obstacle: why it is missed, where that is known.
+        unit: of the number; empty for a ratio.
     """
 
     name: str
@@ -68,6 +50,7 @@ class Budget:
     least: bool
     measure: Callable[[], Measured]
     obstacle: str = ""
+    unit: str = ""
 
     def holds(self, measured: Measured) -> bool:
         """Return whether the median keeps to the limit."""
@@ -89,216 +72,51 @@ def take_turns(over: Callable[[], object], under: Callable[[], object], rounds: 
     return tuple(ratios)
 
 
-def _mission(duration_s: float) -> Log:
-    return simulate(Scenario(mission="lawnmower", duration_s=duration_s, imu="tactical"), seed=4)
+def print_budgets(known: Sequence[Budget], only: str | None, out: Path | None) -> bool:
+    """Measure budgets, print each as soon as it is measured, save them, and return whether all hold.
+
+    Interrupted, it saves what it has and raises KeyboardInterrupt.
+    """
+    chosen = select(known, only)
+    width = max(len(budget.name) for budget in chosen)
+    terminal = console()
+
+    def line(cells: Sequence[str], style: str = "") -> None:
+        name, limit, median, extent, verdict = cells
+        terminal.print(Text(f"{name:{width}}  {limit:>9}  {median:>8}  {extent:>15}  {verdict}".rstrip(), style))
+
+    line(("what over what", "budget", "measured", "from – to", "verdict"), "bold")
+    rows: list[dict[str, Any]] = []
+    try:
+        with progress() as advance:
+            for k, budget in enumerate(chosen):
+                advance(budget.name, k / len(chosen))
+                rows.append(_row(budget))
+                line(_cells(budget, rows[-1]), COLOUR.get(rows[-1]["verdict"], ""))
+                if rows[-1]["note"]:
+                    terminal.print(Text(f"    {rows[-1]['note']}"))
+    finally:
+        save(out, {"budgets": rows})
+    terminal.print("median of the rounds, in which both sides take turns; then the least and the largest round")
+    return all(row["verdict"] == "holds" for row in rows)
 
 
-_simulated = cache(_mission)
+def _row(budget: Budget) -> dict[str, Any]:
+    """Measure a budget, and return what is saved of it."""
+    limit = f"{'≥' if budget.least else '≤'} {budget.limit:g} {budget.unit}".rstrip()
+    row = {"name": budget.name, "budget": limit, "verdict": "not measured", "note": "", "values": []}
+    try:
+        measured = budget.measure()
+    except ModuleNotFoundError as error:
+        return row | {"note": f"{error.name} is not installed: pip install 'fathom-bench[dev]'"}
+    holds = budget.holds(measured)
+    note = "; ".join(filter(None, (measured.note, "" if holds else budget.obstacle)))
+    return row | {"verdict": "holds" if holds else "missed", "note": note, "values": list(measured.values)}
 
 
-def _stepping(log: Log, name: str, **options: Any) -> Callable[[], Any]:
-    """Return what takes every step of a log."""
-    estimator, epochs = create(name, **options), cut(log, score_ticks(log, 1.0)).epochs
-
-    def steps() -> Any:
-        assert log.prior is not None
-        one = estimator.begin(log.prior, log.rig)
-        for epoch in epochs:
-            one.step(epoch)
-        return one
-
-    steps()
-    return steps
-
-
-# -- the rows ---------------------------------------------------------------------------------------------------------
-
-
-def filter_against_filterpy() -> Measured:
-    """Measure how much longer `eskf-filterpy` takes than `eskf`."""
-    log = _simulated(60.0)
-    return Measured(take_turns(_stepping(log, "eskf-filterpy"), _stepping(log, "eskf"), 5))
-
-
-def python_factor() -> Measured:
-    """Measure linearising our displacement factor over GTSAM's of a point in two frames, native: both 3 × 12."""
-    import gtsam
-    from gtsam.symbol_shorthand import L, X
-
-    from ...estimators.graph.gtsam_border import displacement_factor, insert_state
-
-    log = _simulated(60.0)
-    assert log.prior is not None
-    values = gtsam.Values()
-    for i in range(2):
-        insert_state(values, i, log.prior.state, log.rig.imu.R_BS)
-        values.insert(L(i), np.ones(3))
-    cov = 1e-4 * (np.eye(3) + 0.1)
-    ours = displacement_factor(0, 1, np.ones(3), cov)
-    native = gtsam.ReferenceFrameFactorPoint3Pose3(L(0), X(0), L(1), gtsam.noiseModel.Gaussian.Covariance(cov))
-    assert {factor.linearize(values).jacobian()[0].shape for factor in (ours, native)} == {(3, 12)}
-
-    def many(factor: Any) -> None:
-        for _ in range(5000):
-            factor.linearize(values)
-
-    many(ours)
-    many(native)
-    return Measured(take_turns(partial(many, ours), partial(many, native), 7))
-
-
-def window_against_fls(lag_s: float) -> Measured:
-    """Measure how much longer than `window` the cheapest setting of `fls` takes whose RMSE is within 1 % of its."""
-    log = _simulated(90.0)
-
-    def rmse_m(result: Result) -> float:
-        assert log.truth is not None
-        assert result.online is not None, result.cause
-        return ate(log.truth, result.online).rmse_m
-
-    best = rmse_m(run_log(log, create("window", lag_s=lag_s)))
-    good = []
-    for options in CHEAPER:
-        result = run_log(log, create("fls", lag_s=lag_s, **options))
-        if result.status == "done" and rmse_m(result) <= 1.01 * best:
-            good.append((int(result.step_ns.sum()), options))
-    assert good, "no setting of fls is as good"
-    options = min(good, key=lambda each: each[0])[1]
-    said = ", ".join(f"{name} {value}" for name, value in options.items()) or "its defaults"
-    ratios = take_turns(_stepping(log, "fls", lag_s=lag_s, **options), _stepping(log, "window", lag_s=lag_s), 3)
-    return Measured(ratios, f"cheapest fls: {said}")
-
-
-def harness_against_steps() -> Measured:
-    """Measure all but `eskf`'s steps, from a log of ten minutes in memory to its scores, over those steps."""
-    log, estimator, ratios = _simulated(600.0), create("eskf"), []
-    warm_up(estimator)
-    for _ in range(9):
-        started = time.perf_counter_ns()
-        result = run_log(log, estimator)
-        assert result.online is not None
-        scores(log, result.online)
-        total_ns = time.perf_counter_ns() - started
-        steps_ns = int(result.step_ns.sum()) + result.finish_ns
-        ratios.append((total_ns - steps_ns) / steps_ns)
-    return Measured(tuple(ratios))
-
-
-def simulation_against_filter() -> Measured:
-    """Measure simulating ten minutes over running `eskf` on them."""
-    log, estimator = _simulated(600.0), create("eskf")
-    warm_up(estimator)
-    return Measured(take_turns(partial(_mission, 600.0), partial(run_log, log, estimator), 5))
-
-
-def two_workers_against_one() -> Measured:
-    """Measure how many more of 100 runs two processes do at a time than one does, each having done some before."""
-    plan = {
-        "name": "workers",
-        "description": "Many runs.",
-        "logs": [{"scenario": {"duration_s": 60.0}}],
-        "estimators": [{"name": "eskf"}],
-        "seeds": RUNS + WARM_RUNS,
-    }
-    experiment = Experiment.from_dict(plan)
-
-    def rate(jobs: int) -> float:
-        tasks, started = [Task.of(experiment, run) for run in experiment.runs()], 0.0
-        for done, _ in enumerate(run_all(tasks, jobs), 1):
-            if done == WARM_RUNS:
-                started = time.perf_counter()
-        return RUNS / (time.perf_counter() - started)
-
-    ratios = []
-    for _ in range(2):
-        one, two = rate(1), rate(2)
-        ratios.append(two / one)
-    load = os.getloadavg()[0]
-    return Measured(tuple(ratios), f"{os.cpu_count()} cores; load at the end, our own part included: {load:.1f}")
-
-
-def memory_of_an_hour() -> Measured:
-    """Measure the peak memory of opening and running an hour, over that of our imports, by the log's own arrays."""
-    log = _mission(3600.0)
-    imports = (
-        "from fathom.bench import run_log; from fathom.datasets import open_log; from fathom.estimators import create"
-    )
-    run = "import sys; assert run_log(open_log(sys.argv[1]), create('eskf')).status == 'done'"
-    own = array_bytes(log)
-    with TemporaryDirectory() as temporary:
-        folder = str(write_folder(log, Path(temporary) / "hour"))
-        empty, full = (_peak_bytes(code, folder) for code in (imports, f"{imports}; {run}"))
-    return Measured(((full - empty) / own,), f"{own / 1e6:.0f} MB of arrays; {(full - empty) / 1e6:.0f} MB to run them")
-
-
-def array_bytes(value: Any) -> int:
-    """Return how many bytes the arrays of a log take."""
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    if is_dataclass(value):
-        return sum(array_bytes(getattr(value, field.name)) for field in fields(value))
-    return sum(map(array_bytes, value.values())) if isinstance(value, dict) else 0
-
-
-PEAK = """
-try:
-    text = open("/proc/self/status").read()
-    peak = 1024 * int(text.split("VmHWM:")[1].split()[0])
-except OSError:
-    import resource
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print(peak)
-"""
-
-
-def _peak_bytes(code: str, *arguments: str) -> int:
-    """Return the peak memory of a process that runs some code."""
-    command = [sys.executable, "-c", code + PEAK, *arguments]
-    return int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-
-
-def help_against_numpy() -> Measured:
-    """Measure the processor time of `fathom --help` over that of importing numpy."""
-
-    def seconds(*arguments: str) -> float:
-        before = os.times()
-        subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL)
-        after = os.times()
-        return after.children_user + after.children_system - before.children_user - before.children_system
-
-    ask, load = partial(seconds, "-m", "fathom.bench.cli.app", "--help"), partial(seconds, "-c", "import numpy")
-    ask()
-    load()
-    return Measured(tuple(min(ask(), ask()) / min(load(), load()) for _ in range(5)))
-
-
-def scores_against_evo() -> Measured:
-    """Measure how much longer evo takes for ATE and RPE of 100,000 poses; where the two differ, the ratio is 0."""
-    compared = evo.compare(100_000)
-    note = f"they differ by {compared.largest_difference:.0e} at most"
-    if compared.largest_difference > evo.TOLERANCE:
-        return Measured((0.0,), f"not equal: {note}")
-    return Measured(compared.ratios, note)
-
-
-SAME_BLOCK = (
-    "both spend most of their time in the same compiled IMU block and in being called from Python, epoch by epoch; "
-    "only the update is filterpy's"
-)
-
-FROM_CPP = (
-    "a Python factor that fetches nothing and returns constants takes 3.5 times the native one already, and 4.4 times "
-    "where it fetches the two poses, before our compiled lines begin"
-)
-
-BUDGETS: Sequence[Budget] = (
-    Budget("eskf-filterpy over eskf, same log", 50.0, True, filter_against_filterpy, SAME_BLOCK),
-    Budget("our Python factor over a native one, 3 × 12", 4.0, False, python_factor, FROM_CPP),
-    *(Budget(f"fls over window, lag {s:g} s", 5.0, True, partial(window_against_fls, s)) for s in LAGS_S),
-    Budget("harness over eskf's steps, 10 min", 0.5, False, harness_against_steps),
-    Budget("evo over ATE and RPE, 100,000 poses", 100.0, True, scores_against_evo),
-    Budget("simulate over eskf, 10 min", 2.0, False, simulation_against_filter),
-    Budget("two workers over one, 100 runs", 1.8, True, two_workers_against_one),
-    Budget("memory of 1 h over its arrays", 10.0, False, memory_of_an_hour),
-    Budget("fathom --help over import numpy", 4.0, False, help_against_numpy),
-)
+def _cells(budget: Budget, row: dict[str, Any]) -> tuple[str, str, str, str, str]:
+    values = row["values"]
+    if not values:
+        return row["name"], row["budget"], "–", "–", row["verdict"]
+    median = f"{np.median(values):.3g} {budget.unit}".rstrip()
+    return row["name"], row["budget"], median, f"{min(values):.3g} – {max(values):.3g}", row["verdict"]

@@ -15,18 +15,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from rich import box
+from rich.table import Table
 
+from ..output.tables.terminal import console
 from . import benchmarks
 from .benchmarks import Benchmark
-from .processes import Side, started
-from .revision import PREFIX, TimingError, checked_out, share_compiled, working_tree
+from .printing import COLOUR, TimingError, progress, save, select
+from .revision import PREFIX, Side, checked_out, started, working_tree
 
 Array = NDArray[np.float64]
 Verdict = Literal["slower", "slower?", "same", "faster", "new", "broken"]
@@ -100,7 +103,7 @@ class Comparison:
 
 
 Progress = Callable[[str, float], None]
-"""Called with what is going on, and the share of all work that is done."""
+"""Called with what is being done, and the share of all work that is finished."""
 
 
 def compare(revision: str, chosen: Sequence[Benchmark], effort: Effort, limit: float, progress: Progress) -> Comparison:
@@ -142,12 +145,10 @@ def _warm_up(
     """
     answers: list[dict[str, dict[str, Any]]] = []
     for side in (now, then):
-        same = side is then and share_compiled(now.tree.root, then.tree.root)
         with started(side) as (worker,):
             found = {}
             for k, each in enumerate(chosen):
-                what = "loading" if same else "compiling"
-                progress(f"{what} {each.name} of {side.tree.name}", 0.05 + 0.05 * (len(answers) + k / len(chosen)))
+                progress(f"compiling {each.name} of {side.tree.name}", 0.05 + 0.05 * (len(answers) + k / len(chosen)))
                 found[each.name] = worker.ask(prepare=each.name)
         answers.append(found)
     repeats, rows = {}, {}
@@ -236,3 +237,53 @@ def ratio_of(seconds: Array, level: float, seed: int = 0) -> tuple[float, float,
     medians = np.median(logs[drawn[:, :, None], turns].reshape(RESAMPLES, -1), axis=1)
     low, high = np.quantile(medians, [(1 - level) / 2, (1 + level) / 2])
     return math.exp(np.median(logs)), math.exp(low), math.exp(high)
+
+
+def print_comparison(
+    revision: str, only: str | None, short: bool, limit: float, rounds: int, pairs: int, out: Path | None
+) -> bool:
+    """Compare with a revision, print and save what came out, and return whether nothing is slower.
+
+    Raises:
+        TimingError: nothing can be compared.
+    """
+    usual = SHORT if short else FULL
+    effort = Effort(pairs or usual.pairs, rounds or usual.rounds)
+    chosen = select([each for each in benchmarks.BENCHMARKS if each.short or not short], only)
+    with progress() as advance:
+        found = compare(revision, chosen, effort, limit, advance)
+    table = Table(
+        *("benchmark", "group", "per", "now", "then", "ratio", f"{100 * found.level:.1f} % interval", "verdict"),
+        box=box.SIMPLE_HEAD,
+        title=f"{found.now} over {found.then}",
+        caption=(
+            f"processor time, µs; {effort.pairs} pairs of processes, {effort.rounds} turns A B B A each, twice as "
+            f"many of both where marked *; slower: the whole interval is above {limit:g}\n{found.environment}"
+        ),
+        caption_justify="left",
+    )
+    for column in table.columns[3:7]:
+        column.justify = "right"
+    for row in found.rows:
+        numbers = ["–"] * 4
+        if row.ratio is not None:
+            numbers = [
+                _figures(row.now_us),
+                _figures(row.then_us),
+                f"{row.ratio:.3f}",
+                f"{row.low:.3f} – {row.high:.3f}",
+            ]
+        verdict = f"{row.verdict}{'*' if row.again else ''}"
+        table.add_row(row.name, row.group, row.unit, *numbers, verdict, style=COLOUR.get(row.verdict))
+    console().print(table)
+    for row in found.rows:
+        if row.note:
+            print(f"{row.name}: {row.note}")
+    save(out, {"comparison": asdict(found) | {"effort": asdict(effort)}})
+    slow = [row.name for row in found.rows if row.verdict in ("slower", "broken")]
+    print(f"slower or broken: {'; '.join(slow)}" if slow else "nothing is slower")
+    return not slow
+
+
+def _figures(value: float | None) -> str:
+    return "–" if value is None else f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"

@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from rich.console import Console
 
+from ..execution.sweep import run_experiment
+from ..experiment.plan import Experiment
 from ..metrics import pooled_rmse
 from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
 from ..results.summary import Record, groups, records
-from .machine import machine_text
+from .printing import machine_text, made
 
 EXPERIMENT = "cost"
 LAGS_S = (3.0, 10.0, 30.0)
@@ -28,7 +31,7 @@ COLUMNS = (
     "× real time",
     "memory, MB",
 )
-BEGIN, END = "<!-- cost: fathom timing --cost -->", "<!-- /cost -->"
+BEGIN, END = "<!-- cost: fathom timing cost -->", "<!-- /cost -->"
 """Between these two lines of a page stands the table."""
 BOOTSTRAPS = 2000
 
@@ -175,3 +178,22 @@ def write_cost(rows: pd.DataFrame, folder: Path) -> list[Path]:
     page.write_text(cost_markdown(rows), encoding="utf-8")
     pd.DataFrame(cost_records(rows)).to_csv(table, index=False)
     return [page, table, *save(draw_accuracy_cost(rows), folder / "accuracy-cost")]
+
+
+def print_cost(folder: Path | None, out: Path = Path("results")) -> bool:
+    """Run what is missing of the experiment `cost`, one run at a time; print, write and draw the README's table.
+
+    Args:
+        folder: for cost.md, cost.csv and accuracy-cost; default: that of the experiment.
+        out: folder for results.
+
+    Returns:
+        Whether every run reached its end.
+    """
+    plan = Experiment.load(EXPERIMENT)
+    folder = made(folder or out / plan.name)
+    rows = run_experiment(plan, out=out, jobs=1)
+    files = write_cost(rows, folder)
+    print(cost_markdown(rows), end="")
+    Console(stderr=True).print(f"{folder}: {', '.join(file.name for file in files)}", highlight=False)
+    return bool((rows["status"] == "done").all())

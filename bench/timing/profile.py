@@ -1,53 +1,63 @@
-"""Where a step's time goes, the same split for every estimator: a table, and bars."""
+"""Where an estimator's time goes, the same split for every estimator: a table, bars, and by lag and over a log."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import pandas as pd
 from matplotlib.figure import Figure
 from rich import box
+from rich.console import Console
 from rich.table import Table
 
-from ...datasets.log import Log
+from ...datasets import Log, Scenario, simulate
 from ...estimators.interface import Estimator
-from ..output.figures.drawing import PALETTE, WIDTH_IN, empty_figure
-from .driver import PARTS as NAMES
-from .driver import Driver, Timed, quickest
+from ...estimators.registry import ESTIMATORS, create, package_of
+from ..output.figures.drawing import PALETTE, WIDTH_IN, empty_figure, looks_of, save
+from ..output.tables import terminal
+from ..results.store import provenance
+from .passes import PARTS, Timed, quickest, stopwatch
+from .printing import machine_text, made
+from .scaling import by_lag, draw_by_lag, draw_over_log, growth_text, over_log
 
-PARTS = ("propagation", "linearisation", "solve", "marginal", "output", "rest")
 ABOUT = (
-    "propagation: IMU block, preintegration, state and covariance predicted · linearisation: residuals, Jacobians, "
-    "factors made, GTSAM's calls of ours · solve: gain, or factorisation and back-substitution; in GTSAM also its own "
-    "linearisation and its marginalising, which cannot be told apart from outside · marginal: covariance of a state, "
-    "marginalising · output: beliefs, and writing hindsight down · rest: readings sorted, Python, all else"
+    "propagation: IMU block, preintegration, prediction of state and covariance · linearisation: residuals and "
+    "Jacobians of a smoother, factors made, GTSAM's calls of our factors · solve: a filter's whole update; a "
+    "smoother's factorisation and back-substitution, and GTSAM's own linearisation and marginalisation, which cannot "
+    "be told apart from outside · marginal: covariance of a state, marginalisation · output: beliefs, smoothed states "
+    "written down · rest: readings sorted, Python, all else"
 )
 REPEATS = 5
+EVERY = "all"
+SHORT_S, LONG_S = 90.0, 1200.0
+"""Length of the log for the split and the lags, three times the longest lag; and of that for the course over a log."""
+LONGEST_S = {"isam2": 300.0, "batch": 300.0, "fls-batch": 300.0}
+"""Length of the latter for estimators whose cost grows, or that would take too long."""
 
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Profile:
-    """What one estimator's steps and beliefs are made of, on one log.
+    """What the steps and beliefs of one estimator are made of, on one log.
 
     Attributes:
         label: the estimator's.
-        timed: with probes, of each step the quickest of the repeats.
-        plain_ns: all steps and beliefs without probes, of each the quickest of the repeats.
-        compiled_s: time until it was warm with probes, compiling included if it was the first time.
+        timed: with stages timed; of each step the quickest of the repeats.
+        plain_ns: all steps and beliefs without; of each the quickest of the repeats.
     """
 
     label: str
     timed: Timed
     plain_ns: int
-    compiled_s: float
 
     @property
     def shares(self) -> dict[str, float]:
         """Share of each of PARTS; they add up to 1."""
-        parts_ns = dict(zip(NAMES, self.timed.parts_ns.tolist(), strict=True))
-        return {part: parts_ns[part] / self.timed.parts_ns.sum() for part in PARTS}
+        parts_ns = self.timed.parts_ns
+        return dict(zip(PARTS, (parts_ns / parts_ns.sum()).tolist(), strict=True))
 
     @property
     def accounted(self) -> float:
@@ -56,16 +66,16 @@ class Profile:
 
     @property
     def overhead(self) -> float:
-        """What the probes add, as a share of the time without them."""
+        """What timing the stages adds, as a share of the time without."""
         return self.timed.whole_ns / self.plain_ns - 1
 
     @property
     def keyframes(self) -> int | None:
-        """Of a smoother; None where there are none."""
+        """Number of keyframes of a smoother; None where there are none."""
         return self.timed.counts.get("keyframes")
 
     def record(self) -> dict[str, float | str | None]:
-        """Return the row of a table: times without probes, shares with them."""
+        """Return the row of a table: times without timing the stages, shares with it."""
         return {
             "estimator": self.label,
             "us_per_step": self.plain_ns / len(self.timed.step_ns) / 1e3,
@@ -74,36 +84,35 @@ class Profile:
             **{f"{part}_share": share for part, share in self.shares.items()},
             "finish_ms": self.timed.finish_ns / 1e6,
             "accounted": self.accounted,
-            "probes_add": self.overhead,
+            "timing_adds": self.overhead,
         }
 
 
 def profile(
     estimators: Mapping[str, Estimator], log: Log, repeats: int = REPEATS, tell: Tell = lambda doing: None
 ) -> list[Profile]:
-    """Return the profile of each estimator on a log, in their order; runs with probes and without take turns.
+    """Return the profile of each estimator on a log, in their order; runs with stages timed and without take turns.
 
     Args:
-        estimators: by label. Of another package's estimator it shows what that calls of ours, and the rest.
-        log: which all of them go through.
+        estimators: by label. An estimator that marks no stages is all rest.
+        log: all of them run on it.
         repeats: of each run.
-        tell: told what is being done.
+        tell: called with what is being done.
 
     Raises:
-        EstimatorError: one did not come to the end.
+        EstimatorError: an estimator did not reach the end.
     """
     profiles = []
-    with Driver(probed=True) as probed, Driver(probed=False) as plain:
+    with stopwatch() as process:
         for label, estimator in estimators.items():
-            tell(f"{label}: compiling with probes, if this is the first time")
-            compiled_s = probed.warm_up(estimator)
-            plain.warm_up(estimator)
-            with_probes, without = [], []
+            tell(f"{label}: compiling, if this is the first time")
+            process.warm_up(estimator)
+            staged, plain = [], []
             for k in range(repeats):
                 tell(f"{label}: run {k + 1} of {repeats}")
-                with_probes.append(probed.run(log, estimator))
-                without.append(plain.run(log, estimator))
-            profiles.append(Profile(label, quickest(with_probes), quickest(without).whole_ns, compiled_s))
+                staged.append(process.run(log, estimator, stages=True))
+                plain.append(process.run(log, estimator))
+            profiles.append(Profile(label, quickest(staged), quickest(plain).whole_ns))
     return profiles
 
 
@@ -112,7 +121,7 @@ def profile_table(profiles: Sequence[Profile]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
     table.add_column("estimator")
     headings = ("µs per\nstep", "IMU\nsample", "key-\nframe", "propa-\ngation %", "linear-\nisation %", "solve\n%")
-    for heading in (*headings, "mar-\nginal %", "output\n%", "rest\n%", "finish\nms", "probes\nadd %"):
+    for heading in (*headings, "mar-\nginal %", "output\n%", "rest\n%", "finish\nms", "timing\nadds %"):
         table.add_column(heading, justify="right")
     for one in profiles:
         row = one.record()
@@ -150,3 +159,54 @@ def draw_profile(profiles: Sequence[Profile], title: str) -> Figure:
     axes.grid(visible=False, axis="y")
     figure.legend(loc="outside lower center", ncols=len(PARTS), frameon=False, fontsize=8)
     return figure
+
+
+def print_profile(names: Sequence[str], folder: Path | None) -> None:
+    """Print and draw where the time of these estimators goes, by stage, by lag and over a log.
+
+    Args:
+        names: of estimators; "all" for every one of ours.
+        folder: for profile.csv and the figures; default: results/profile.
+
+    Raises:
+        EstimatorError: an estimator is not known, or did not reach the end.
+        TimingError: the folder cannot be made.
+    """
+    folder = made(folder or Path("results") / "profile")
+    chosen = list(ESTIMATORS) if EVERY in names else list(dict.fromkeys(names))
+    estimators = {name: create(name) for name in chosen}
+    looks = looks_of(list(ESTIMATORS | estimators))
+    console = Console(stderr=True)
+    with console.status("") as status:
+        log = _survey(SHORT_S)
+        profiles = profile(estimators, log, tell=status.update)
+        lags = by_lag(estimators, log, tell=status.update)
+        courses = {}
+        for duration_s in sorted({LONGEST_S.get(name, LONG_S) for name in chosen}):
+            some = {name: one for name, one in estimators.items() if LONGEST_S.get(name, LONG_S) == duration_s}
+            courses |= over_log(some, _survey(duration_s), tell=status.update)
+    files = [folder / "profile.csv"]
+    pd.DataFrame([one.record() for one in profiles]).to_csv(files[0], index=False)
+    title = f"{log.name}, {log.duration_s:.0f} s"
+    files += save(draw_profile(profiles, f"{title}: where the time goes"), folder / "profile")
+    files += save(draw_by_lag(lags, looks, f"{title}: steps against lag"), folder / "step-against-lag")
+    files += save(draw_over_log(courses, looks, f"{log.name}: steps against time in the log"), folder / "step-over-log")
+
+    out = terminal.console()
+    out.print(profile_table(profiles))
+    out.print(ABOUT)
+    out.print(f"{title}; of each step the quickest of {REPEATS} repeats; µs with no stage timed, shares with all timed")
+    out.print(machine_text(provenance()["machine"], provenance()["versions"]))
+    for name in chosen:
+        if package_of(name) is not None:
+            out.print(f"{name} is from another package: what it does not mark as a stage is rest")
+    for label, by in lags.items():
+        if None not in by:
+            out.print(f"{label}, ms per second at lag: " + ", ".join(f"{lag:g} s {ms:.3g}" for lag, ms in by.items()))
+    for label, one in courses.items():
+        out.print(f"{label}, over {one.t_s[-1] / 60:.0f} minutes: {growth_text(one)}")
+    console.print(f"{folder}: {', '.join(file.name for file in files)}", highlight=False)
+
+
+def _survey(duration_s: float) -> Log:
+    return simulate(Scenario(mission="lawnmower", duration_s=duration_s, imu="tactical"), seed=1)

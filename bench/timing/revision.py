@@ -1,4 +1,4 @@
-"""Another revision to compare with: its own checkout, its own compiled code, and its own packages where pins differ."""
+"""Another revision to compare with: a checkout of it, with packages of its own where its pins differ from ours."""
 
 from __future__ import annotations
 
@@ -9,22 +9,18 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Any
 
-from ..errors import ExperimentError
+from ..execution.child import Child, start
+from .printing import TimingError
 
 ROOT = Path(__file__).resolve().parents[2]
 PREFIX = "fathom-timing-"
-TYPES_OF_A_LOG = ("epochs", "state", "rig", "log", "trajectory")
-"""What compiled code knows of `datasets`."""
-
-
-class TimingError(ExperimentError):
-    """Nothing can be compared: no such revision, no repository, an environment that cannot be made."""
+"""A worktree's folder is called so, with the number of the process that made it."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +55,74 @@ class Tree:
         return folder
 
 
+@dataclass(frozen=True)
+class Side:
+    """A tree, the folder that leads to its packages, and the inputs; processes of it can be started."""
+
+    tree: Tree
+    packages: Path
+    inputs: Path
+
+    def start(self) -> Worker:
+        """Start a process."""
+        here = Path(__file__).parent
+        child = start(
+            f"{here / 'worker.py'}:main",
+            *map(str, (self.packages, here / "benchmarks.py", self.inputs)),
+            python=self.tree.python,
+            path=(),
+            environment={"PYTHONHASHSEED": "0"},
+        )
+        return Worker(self.tree.name, child)
+
+
+@dataclass(frozen=True, eq=False)
+class Worker:
+    """A process that times benchmarks, see `worker`."""
+
+    name: str
+    child: Child
+
+    def send(self, **command: Any) -> None:
+        """Hand over a command; the answer can then be received."""
+        with suppress(OSError):  # `receive` reports it
+            self.child.connection.send(command)
+
+    def receive(self) -> dict[str, Any]:
+        """Return the answer to the last command.
+
+        Raises:
+            TimingError: the process has died.
+        """
+        try:
+            return self.child.connection.recv()
+        except (EOFError, OSError):
+            code = self.child.process.wait()
+            raise TimingError(f"{self.name}: its process died (exit code {code}); its last words are above") from None
+
+    def ask(self, **command: Any) -> dict[str, Any]:
+        """Send a command and return the answer."""
+        self.send(**command)
+        return self.receive()
+
+
+@contextmanager
+def started(*sides: Side) -> Iterator[list[Worker]]:
+    """Start a process of each side; they are gone afterwards."""
+    with ExitStack() as stack:
+        workers = []
+        for side in sides:
+            workers.append(side.start())
+            stack.enter_context(workers[-1].child)
+        yield workers
+
+
 def working_tree() -> Tree:
     """Return the tree that this file is in, as it is, uncommitted changes included."""
     if not (ROOT / "pyproject.toml").is_file() or _git("rev-parse", "--is-inside-work-tree") is None:
-        raise TimingError(f"{ROOT}: no git checkout of fathom; --against compares a checkout with its own history")
+        raise TimingError(
+            f"{ROOT}: no git checkout of fathom; `fathom timing against` compares a checkout with its history"
+        )
     described = _git("describe", "--always", "--dirty", "--exclude=*") or "unknown"
     return Tree(f"working tree ({described})", ROOT, Path(sys.executable), "this environment")
 
@@ -92,28 +152,6 @@ def checked_out(revision: str, folder: Path) -> Iterator[Tree]:
         yield Tree(name, path, python, environment)
     finally:
         _git("worktree", "remove", "--force", str(path))
-
-
-def share_compiled(ours: Path, theirs: Path) -> bool:
-    """Hand over our compiled code where their sources of it are ours; return whether they are.
-
-    numba knows code by the time and size of its source, so these files take over our times, too.
-    """
-    sources = [path.relative_to(ours) for path in sorted((ours / "estimators").glob("*.py"))]
-    of_logs = [Path("datasets", f"{name}.py") for name in TYPES_OF_A_LOG]
-    same = {path.name for path in (theirs / "estimators").glob("*.py")} == {path.name for path in sources}
-    if not same or not all((theirs / path).is_file() for path in of_logs):
-        return False
-    if any((ours / path).read_bytes() != (theirs / path).read_bytes() for path in [*sources, *of_logs]):
-        return False
-    for path in sources:
-        shutil.copystat(ours / path, theirs / path)
-    compiled = theirs / "estimators" / "__pycache__"
-    compiled.mkdir(exist_ok=True)
-    for path in (ours / "estimators" / "__pycache__").iterdir():
-        if path.suffix in (".nbi", ".nbc", ".txt"):
-            shutil.copy2(path, compiled)
-    return True
 
 
 def _environment(tree: Path, folder: Path) -> tuple[Path, str]:

@@ -1,9 +1,9 @@
-"""How a step's time depends on the lag, and on how far into the log it is: the latter ought to be flat."""
+"""How the time of a step depends on the lag, and on the time in the log; the latter should be constant."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -15,19 +15,21 @@ from ...datasets.log import Log
 from ...datasets.state import Array, TimeArray
 from ...estimators.interface import Estimator
 from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
-from .driver import Driver, quickest
-from .profile import Tell
+from .passes import Stopwatch, quickest, stopwatch
 
 LAGS_S = (1.0, 3.0, 10.0, 30.0)
 PIECES = 24
-"""A log is cut into so many pieces of equal length."""
+"""Pieces of equal length that a log is cut into: of 20 minutes, 50 s each, with 250 keyframes."""
 BOOTSTRAPS = 2000
+"""Resamples: the ends of a 95 % interval are then the 50th from either side."""
 TEN_MINUTES_S = 600.0
+
+Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps of one estimator on one log: of each the quickest of the repeats, for its work is always the same.
+    """The steps of one estimator on one log; of each the quickest of the repeats, whose work is the same.
 
     Attributes:
         t_s: (epochs,) from the start of the log.
@@ -38,14 +40,14 @@ class Steps:
     step_ns: TimeArray
 
     def ms_per_s(self, begin_s: float, end_s: float) -> float:
-        """Return the computing of the steps in (begin_s, end_s], ms per second of voyage."""
+        """Return the time of the steps in (begin_s, end_s], ms per second of voyage."""
         inside = (self.t_s > begin_s) & (self.t_s <= end_s)
         return float(self.step_ns[inside].sum()) * 1e-6 / (end_s - begin_s)
 
 
-def step_times(driver: Driver, log: Log, estimator: Estimator, repeats: int = 3) -> Steps:
-    """Return the step times of an estimator that is warm."""
-    timed = quickest([driver.run(log, estimator) for _ in range(repeats)])
+def step_times(process: Stopwatch, log: Log, estimator: Estimator, repeats: int = 3) -> Steps:
+    """Return the step times of an estimator that is compiled."""
+    timed = quickest([process.run(log, estimator) for _ in range(repeats)])
     return Steps(1e-9 * timed.t_ns.astype(np.float64), timed.step_ns)
 
 
@@ -56,15 +58,15 @@ def by_lag(
     repeats: int = 3,
     tell: Tell = lambda doing: None,
 ) -> dict[str, dict[float | None, float]]:
-    """Return the computing of each estimator's steps, ms per second of voyage, by its lag (None: it has none).
+    """Return the time of each estimator's steps, ms per second of voyage, by its lag (None: it has none).
 
-    Taken from when the longest window is full.
+    Only steps after the longest window is full count.
     """
     found: dict[str, dict[float | None, float]] = {}
     full_s, end_s = max(lags_s), log.duration_s
-    with Driver(probed=False) as driver:
+    with stopwatch() as process:
         for label, estimator in estimators.items():
-            driver.warm_up(estimator)
+            process.warm_up(estimator)
             lagged: Any = estimator
             variants: dict[float | None, Estimator] = {None: estimator}
             if hasattr(estimator, "lag_s"):
@@ -72,18 +74,18 @@ def by_lag(
             found[label] = {}
             for lag_s, variant in variants.items():
                 tell(f"{label}: lag {lag_s or 0:g} s")
-                found[label][lag_s] = step_times(driver, log, variant, repeats).ms_per_s(full_s, end_s)
+                found[label][lag_s] = step_times(process, log, variant, repeats).ms_per_s(full_s, end_s)
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """How the computing goes as the log goes on.
+    """How the time of steps changes as the log goes on.
 
     Attributes:
         t_s: (pieces,) middle of each piece of the log.
-        ms_per_s: (pieces,) computing of its steps, ms per second of voyage.
-        growth: what ten minutes more add, as a share of the mean, with its 95 % bootstrap interval over the pieces.
+        ms_per_s: (pieces,) time of its steps, ms per second of voyage.
+        growth: increase in ten minutes, as a share of the mean, with its 95 % bootstrap interval over the pieces.
     """
 
     t_s: Array
@@ -92,7 +94,7 @@ class Course:
 
 
 def course(steps: Steps, from_s: float, pieces: int = PIECES) -> Course:
-    """Return the course of the steps after from_s, when the window is full."""
+    """Return the course of the steps after from_s, the time at which the window is full."""
     edges = np.linspace(from_s, float(steps.t_s[-1]), pieces + 1)
     cost = np.array([steps.ms_per_s(a, b) for a, b in pairwise(edges)])
     t_s = 0.5 * (edges[:-1] + edges[1:])
@@ -111,19 +113,19 @@ def _growth(t_s: Array, cost: Array) -> float:
 def over_log(
     estimators: Mapping[str, Estimator], log: Log, repeats: int = 3, tell: Tell = lambda doing: None
 ) -> dict[str, Course]:
-    """Return the course of each estimator's computing over a log, from when its window is full."""
+    """Return the course of each estimator's steps over a log, from the time at which its window is full."""
     found = {}
-    with Driver(probed=False) as driver:
+    with stopwatch() as process:
         for label, estimator in estimators.items():
             tell(f"{label}: {log.duration_s / 60:.0f} minutes")
-            driver.warm_up(estimator)
-            steps = step_times(driver, log, estimator, repeats)
+            process.warm_up(estimator)
+            steps = step_times(process, log, estimator, repeats)
             found[label] = course(steps, min(float(getattr(estimator, "lag_s", 0.0)), 0.5 * log.duration_s))
     return found
 
 
 def draw_by_lag(found: Mapping[str, Mapping[float | None, float]], looks: Mapping[str, Look], title: str) -> Figure:
-    """Draw the computing against the lag; what has none is a horizontal line."""
+    """Draw the time of steps against the lag; an estimator without a lag is a horizontal line."""
     figure, (axes,) = empty_figure(1, 1, WIDTH_IN, 4.0)
     for label, by in found.items():
         look = looks[label]
@@ -150,7 +152,7 @@ def draw_by_lag(found: Mapping[str, Mapping[float | None, float]], looks: Mappin
 
 
 def draw_over_log(courses: Mapping[str, Course], looks: Mapping[str, Look], title: str) -> Figure:
-    """Draw the computing against how far into the log it is; the legend tells the growth in ten minutes."""
+    """Draw the time of steps against the time in the log; the legend has the growth in ten minutes."""
     figure, (axes,) = empty_figure(1, 1, WIDTH_IN, 4.2)
     handles = []
     for label, one in courses.items():

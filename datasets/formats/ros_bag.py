@@ -23,7 +23,7 @@ from ..errors import DatasetError, nearest, nearest_file
 from .mcap_file import mcap_messages
 from .recording import extra
 from .ros_messages import Definition, Definitions, Types, definitions_of, parse_definitions, ros_channel, short_name
-from .topics import NS, Channel, Found, Message, TopicRecording
+from .topics import NS, Channel, Message, ScanResult, TopicRecording
 
 MAGIC_1 = b"#ROSBAG V2.0\n"
 MESSAGE_DATA, CHUNK, CONNECTION = 2, 5, 7
@@ -46,7 +46,7 @@ class RosRecording(TopicRecording):
     definitions: tuple[str, ...] = ()
     """Files of further definitions: `…/package/msg/Name.msg`, or many in one, under lines `MSG: package/Name`."""
 
-    def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+    def messages(self, folder: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
         """Yield the messages of a bag; see `TopicRecording.messages`."""
         path = self.path(folder)
         if path.name == "metadata.yaml":
@@ -115,11 +115,11 @@ class _Distribution(dict[str, Definition]):
 # ------------------------------------------------------------------------------------------------------------- ROS 1
 
 
-def ros1_messages(path: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
-    """Yield the messages of a ROS 1 bag; what is damaged is passed over and told in `found.notes`.
+def ros1_messages(path: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
+    """Yield the messages of a ROS 1 bag; what is damaged is skipped and told in `found.notes`.
 
     Raises:
-        DatasetError: not a ROS 1 bag of version 2.0, or not one whole message in it.
+        DatasetError: not a ROS 1 bag of version 2.0, or contains no whole message.
     """
     size = path.stat().st_size
     bag = _Bag(path, topics, found)
@@ -149,17 +149,17 @@ def ros1_messages(path: Path, topics: Collection[str] | None, found: Found) -> I
             at = start + length
             stream.seek(at)
     if not bag.whole:
-        raise DatasetError(f"{path}: not one whole message in it{'; ' if found.notes else ''}{'; '.join(found.notes)}")
+        raise DatasetError(f"{path}: contains no whole message{'; ' if found.notes else ''}{'; '.join(found.notes)}")
     if bag.damaged:
         found.notes.append(
-            f"{path.name}: {bag.damaged} damaged chunks or records; what cannot be read of them is passed over"
+            f"{path.name}: {bag.damaged} damaged chunks or records; what cannot be read of them is skipped"
         )
 
 
 class _Bag:
     """What is known of a ROS 1 bag while its records go by."""
 
-    def __init__(self, path: Path, topics: Collection[str] | None, found: Found) -> None:
+    def __init__(self, path: Path, topics: Collection[str] | None, found: ScanResult) -> None:
         self.path, self.topics, self.found = path, topics, found
         self.connections: dict[bytes, Channel] = {}
         self.whole = self.damaged = 0
@@ -275,7 +275,7 @@ def _decompressed(compression: bytes, data: bytes) -> bytes:
 
 
 def _ros2_messages(
-    path: Path, types: Types, distro: str | None, topics: Collection[str] | None, found: Found
+    path: Path, types: Types, distro: str | None, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
     about = _metadata(path) if path.is_dir() else {}
     files = _files(path, about) if path.is_dir() else [path]
@@ -356,7 +356,7 @@ def _zstd(data: bytes) -> bytes:
 
 
 def _sqlite_messages(
-    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: Found
+    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
     """Yield the messages of a SQLite database; `path` is what errors call it, `plain` where it lies uncompressed."""
     row = before = 0
@@ -413,7 +413,7 @@ def _cdr_channel(topic: str, kind: str, carried: tuple[str, str] | None, types: 
 
 
 def _mcap_messages(
-    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: Found
+    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
     for channel, (log_ns, _), data in mcap_messages(plain, types, topics, found, path):
         yield channel, (log_ns,), data

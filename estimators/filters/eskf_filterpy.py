@@ -18,7 +18,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import DIM, Array, Belief
 from ..physics.imu import integrate, predict, process_noise
 from ..physics.measurements import measure
-from .eskf import inject
+from ..physics.state import inject
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 

@@ -21,9 +21,9 @@ from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ...datasets.trajectory import Trajectory
 from ..interface import FACTORS, Diverged, Factors, Gate, Inflation
-from ..physics.imu import BLOCK, compile_rig, first_sample
+from ..physics.imu import BLOCK, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
-from ..physics.records import as_belief, as_record, split, with_rate_noise
+from ..physics.state import as_belief, as_record, with_rate_noise
 
 
 @dataclass(frozen=True)

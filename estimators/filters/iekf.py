@@ -31,19 +31,22 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, POSITION, THETA, VELOCITY, Array, Belief
-from ..physics.imu import integrate, predict, process_noise, sandwich
+from ..physics.blocks import identity, set_block, set_product
+from ..physics.compiled import compiled, inner
+from ..physics.elimination import absorb, add_scaled
+from ..physics.imu import integrate, predict, process_noise, sandwich, turns
 from ..physics.measurements import measure
-from ..physics.so3 import cross, exp, product, right_jacobian, skew, transform
-from .eskf import absorb
+from ..physics.so3 import cross_into, exp, product, right_jacobian, skew_into, transform, transform_into
+from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 PHI, RHO, NU = THETA, POSITION, VELOCITY
+PHI_0, RHO_0, NU_0 = THETA_0, POSITION_0, VELOCITY_0
 """The invariant error stands in the order of ours."""
 
 
@@ -54,7 +57,8 @@ class InvariantKalmanFilter(FilterOptions):
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
         kalman, x = InvariantKalman(prior.state.p_WB_W.copy()), prior.state
-        P = sandwich(to_invariant(x.R_WB, np.zeros(3), x.v_WB_W), prior.P)
+        A = to_invariant(x.R_WB, np.zeros(3), x.v_WB_W)
+        P = A @ prior.P @ A.T
         return FilterPass(self, Belief(prior.t_ns, x, P), rig, kalman)
 
 
@@ -77,46 +81,69 @@ class InvariantKalman(Kalman):
     def error_covariance(self, state: NDArray[Any]) -> Array:
         """See `Kalman.error_covariance`. (The rate noise that a belief adds to v is the same in nu.)"""
         s = state[0]
-        return sandwich(from_invariant(s["R_WB"], s["p_WB_W"] - self._origin, s["v_WB_W"]), s["P"])
+        A = from_invariant(s["R_WB"], s["p_WB_W"] - self._origin, s["v_WB_W"])
+        P = A @ s["P"] @ A.T
+        return 0.5 * (P + P.T)
 
 
-@njit(cache=True)
+@compiled
 def to_invariant(R_WB: Array, p_OB_W: Array, v_WB_W: Array) -> Array:
     """Derivative (15, 15) of (xi, biases) by our error state; p_OB_W is B's position from the origin of the group."""
-    A = np.eye(DIM)
-    A[PHI, THETA] = R_WB
-    A[RHO, THETA] = product(skew(p_OB_W), R_WB)
-    A[NU, THETA] = product(skew(v_WB_W), R_WB)
+    A, S = np.empty((DIM, DIM)), np.empty((3, 3))
+    identity(A)
+    set_block(A, PHI_0, THETA_0, 1.0, R_WB)
+    skew_into(p_OB_W, S)
+    set_product(A, RHO_0, THETA_0, 1.0, S, R_WB)
+    skew_into(v_WB_W, S)
+    set_product(A, NU_0, THETA_0, 1.0, S, R_WB)
     return A
 
 
-@njit(cache=True)
+@compiled
 def from_invariant(R_WB: Array, p_OB_W: Array, v_WB_W: Array) -> Array:
     """Inverse of `to_invariant`: theta = Rᵀ phi, p_error = rho − p × phi, v_error = nu − v × phi."""
-    A = np.eye(DIM)
-    A[THETA, PHI] = R_WB.T
-    A[POSITION, PHI] = -skew(p_OB_W)
-    A[VELOCITY, PHI] = -skew(v_WB_W)
+    A, S = np.empty((DIM, DIM)), np.empty((3, 3))
+    identity(A)
+    for i in range(3):
+        for j in range(3):
+            A[THETA_0 + i, PHI_0 + j] = R_WB[j, i]
+    skew_into(p_OB_W, S)
+    set_block(A, POSITION_0, PHI_0, -1.0, S)
+    skew_into(v_WB_W, S)
+    set_block(A, VELOCITY_0, PHI_0, -1.0, S)
     return A
 
 
-@njit(cache=True)
+@compiled
 def propagate_invariant(
     state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any], origin: Array
 ) -> None:
     """x ← f(x, imu), P ← Φ P Φᵀ + A Q Aᵀ, with A = `to_invariant` at the end."""
-    s = state[0]
-    F, Q, R_i = np.empty((DIM, DIM)), np.empty((DIM, DIM)), s.R_WB.copy()
-    back = from_invariant(R_i, s.p_WB_W - origin, s.v_WB_W)
+    s, F, Q, none = state[0], np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.zeros((DIM, DIM))
+    back = from_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
     integrate(imu, before, s.b_a, s.b_g, rig, block)
+    process_noise(block, s.R_WB, Q)
     predict(block, state, rig[0].gravity, F, state)
-    process_noise(block, R_i, Q)
     A = to_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
-    Phi = A @ F @ back if block[0].w_CW_W.any() else invariant_transition(block, rig[0].gravity, F, A)
-    s.P[:] = sandwich(Phi, s.P) + sandwich(A, Q)
+    if turns(block[0].w_CW_W):
+        Phi, AF = np.zeros((DIM, DIM)), np.zeros((DIM, DIM))
+        add_product(A, F, AF)
+        add_product(AF, back, Phi)
+    else:
+        Phi = invariant_transition(block, rig[0].gravity, F, A)
+    sandwich(A, Q, none, Q)
+    sandwich(Phi, s.P, Q, s.P)
 
 
-@njit(cache=True)
+@inner
+def add_product(A: Array, B: Array, out: Array) -> None:
+    """out += A B, all (15, 15)."""
+    for i in range(DIM):
+        for k in range(DIM):
+            add_scaled(out[i], A[i, k], B[k])
+
+
+@compiled
 def invariant_transition(block: NDArray[Any], gravity: float, F: Array, A: Array) -> Array:
     """Φ (15, 15) of a block: constant for the group, [g]× and T; only the biases' columns come from F and the state.
 
@@ -128,49 +155,55 @@ def invariant_transition(block: NDArray[Any], gravity: float, F: Array, A: Array
         F: transition of our error state, from `predict`.
         A: `to_invariant` at the block's end.
     """
-    T, Phi = block[0].T, np.eye(DIM)
+    T, Phi = block[0].T, np.empty((DIM, DIM))
+    identity(Phi)
     for i in range(3):
-        Phi[3 + i, 6 + i] = T
-    Phi[6, 1], Phi[7, 0] = gravity * T, -gravity * T  # T [g_W]×
-    Phi[3, 1], Phi[4, 0] = 0.5 * gravity * T**2, -0.5 * gravity * T**2
-    for i in range(9):
-        for j in range(9, DIM):
-            Phi[i, j] = F[i, j] if i >= 3 else 0.0
+        Phi[RHO_0 + i, NU_0 + i] = T
+    for i, j, sign in ((0, 1, 1.0), (1, 0, -1.0)):  # [g_W]×
+        Phi[NU_0 + i, PHI_0 + j] = sign * gravity * T
+        Phi[RHO_0 + i, PHI_0 + j] = sign * 0.5 * gravity * T**2
+    for i in range(ACCEL_BIAS_0):
+        for j in range(ACCEL_BIAS_0, DIM):
+            Phi[i, j] = F[i, j] if i >= POSITION_0 else 0.0
             for k in range(3):
-                Phi[i, j] += A[i, k] * F[k, j]
+                Phi[i, j] += A[i, THETA_0 + k] * F[THETA_0 + k, j]
     return Phi
 
 
-@njit(cache=True)
+@compiled
 def correct_invariant(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any], origin: Array) -> bool:
     """Correct by all readings, linearised together at the predicted state; False where that is impossible.
 
     H by the invariant error is H · `from_invariant`: for a DVL (0, 0, R_BW).
     """
-    s, dx = state[0], np.zeros(DIM)
-    r, H, C = np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
-    p_OB_W, v_WB_W = s.p_WB_W - origin, s.v_WB_W
+    s, dx, r, H, C = state[0], np.zeros(DIM), np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
+    by_phi, p_OB_W, v_WB_W = np.empty((3, 3)), s.p_WB_W - origin, s.v_WB_W
     for m in range(len(readings)):
         n = measure(readings, m, state, rig, r, H, C)
-        for i in range(n):
-            H[i, PHI] = transform(s.R_WB, H[i, THETA]) + cross(p_OB_W, H[i, POSITION]) + cross(v_WB_W, H[i, VELOCITY])
-        if not absorb(n, r, H, C, s.P, dx):
+        for row in range(n):
+            transform_into(s.R_WB, H[row, THETA], by_phi[0])
+            cross_into(p_OB_W, H[row, POSITION], by_phi[1])
+            cross_into(v_WB_W, H[row, VELOCITY], by_phi[2])
+            for i in range(3):
+                H[row, PHI_0 + i] = by_phi[0, i] + by_phi[1, i] + by_phi[2, i]
+        if not absorb(n, r, H, C, dx, s.P):
             return False
     inject_invariant(state, dx, origin)
-    for i in range(DIM):
-        for j in range(i):
-            s.P[i, j] = s.P[j, i] = 0.5 * (s.P[i, j] + s.P[j, i])
+    symmetrise(s.P)
     return np.isfinite(dx.sum())
 
 
-@njit(cache=True)
+@compiled
 def inject_invariant(state: NDArray[Any], dx: Array, origin: Array) -> None:
     """X ← Exp(xi) X: R ← Exp(phi) R, v ← Exp(phi) v + J_l(phi) nu, p likewise about the origin."""
     s = state[0]
     turn, J_l = exp(dx[PHI]), right_jacobian(-dx[PHI])
-    s.R_WB[:] = product(turn, s.R_WB)
-    s.p_WB_W[:] = origin + transform(turn, s.p_WB_W - origin) + transform(J_l, dx[RHO])
-    s.v_WB_W[:] = transform(turn, s.v_WB_W) + transform(J_l, dx[NU])
+    R_WB, p, v = product(turn, s.R_WB), transform(turn, s.p_WB_W - origin), transform(turn, s.v_WB_W)
+    moved, gained = transform(J_l, dx[RHO]), transform(J_l, dx[NU])
     for i in range(3):
-        s.b_a[i] += dx[9 + i]
-        s.b_g[i] += dx[12 + i]
+        for j in range(3):
+            s.R_WB[i, j] = R_WB[i, j]
+        s.p_WB_W[i] = origin[i] + p[i] + moved[i]
+        s.v_WB_W[i] = v[i] + gained[i]
+        s.b_a[i] += dx[ACCEL_BIAS_0 + i]
+        s.b_g[i] += dx[GYRO_BIAS_0 + i]

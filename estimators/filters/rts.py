@@ -13,11 +13,9 @@ x^S_k by the right Jacobian of d.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
@@ -26,10 +24,12 @@ from ...datasets.rig import Rig
 from ...datasets.state import DIM, THETA, Array, Belief
 from ...datasets.trajectory import Trajectory
 from ..interface import Diverged
-from ..physics.imu import BLOCK, STATE, predict, process_noise, sandwich
-from ..physics.records import as_belief, as_record, with_rate_noise
-from ..physics.so3 import inverse_right_jacobian, log, product
-from .eskf import ErrorStateKalman, inject
+from ..physics.compiled import compiled
+from ..physics.elimination import divide_into
+from ..physics.imu import BLOCK, predict, process_noise, sandwich
+from ..physics.so3 import inverse_right_jacobian_into
+from ..physics.state import STATE, as_belief, as_record, inject, local, turn_covariance, with_rate_noise
+from .eskf import ErrorStateKalman
 from .filter_pass import FilterOptions, FilterPass
 
 TRIANGLE = DIM * (DIM + 1) // 2
@@ -127,7 +127,7 @@ STANDSTILL = np.zeros(1, BLOCK)
 STANDSTILL["dR"] = np.eye(3)
 
 
-@njit(cache=True)
+@compiled
 def keep(state: NDArray[Any], row: int, mean: Array, P: Array) -> None:
     """Write a STATE record into one row of a page."""
     s, n = state[0], 0
@@ -142,7 +142,7 @@ def keep(state: NDArray[Any], row: int, mean: Array, P: Array) -> None:
             n += 1
 
 
-@njit(cache=True)
+@compiled
 def recall(mean: Array, P: Array, row: int, state: NDArray[Any]) -> None:
     """Inverse of `keep`."""
     s, n = state[0], 0
@@ -157,7 +157,7 @@ def recall(mean: Array, P: Array, row: int, state: NDArray[Any]) -> None:
             n += 1
 
 
-@njit(cache=True)
+@compiled
 def smooth(
     mean: Array, P: Array, blocks: NDArray[Any], filled: int, tick: NDArray[np.bool_],
     later: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], out: NDArray[Any],
@@ -186,70 +186,40 @@ def smooth(
     return True
 
 
-@njit(cache=True)
+@compiled
 def smooth_one(
     now: NDArray[Any], later: NDArray[Any], block: NDArray[Any], gravity: float, ahead: NDArray[Any]
 ) -> bool:
     """Smooth `now`, in place, given the smoothed state `later` and the block between; `ahead` is scratch."""
-    s, e, a = now[0], later[0], ahead[0]
-    F, Q, d = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty(DIM)
+    F, Q, P_ahead = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    FP, Gt, J, d = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty((3, 3)), np.empty(DIM)
+    P, gained = now[0].P, later[0].P.copy()
     predict(block, now, gravity, F, ahead)
-    process_noise(block, s.R_WB, Q)
-    P_ahead = sandwich(F, s.P) + Q
+    process_noise(block, now[0].R_WB, Q)
+    sandwich(F, P, Q, P_ahead)
 
-    d[THETA] = log(product(a.R_WB.T, e.R_WB))
-    for i in range(3):
-        d[3 + i], d[6 + i] = e.p_WB_W[i] - a.p_WB_W[i], e.v_WB_W[i] - a.v_WB_W[i]
-        d[9 + i], d[12 + i] = e.b_a[i] - a.b_a[i], e.b_g[i] - a.b_g[i]
-    J, gained = inverse_right_jacobian(d[THETA]), e.P.copy()
-    gained[THETA, :] = J @ np.ascontiguousarray(gained[THETA, :])
-    gained[:, THETA] = np.ascontiguousarray(gained[:, THETA]) @ J.T
-    gained -= P_ahead
+    local(ahead, later, d)
+    inverse_right_jacobian_into(d[THETA], J)
+    turn_covariance(gained, J)
+    for i in range(DIM):
+        for j in range(DIM):
+            gained[i, j] -= P_ahead[i, j]
+            FP[i, j] = 0.0
+            for k in range(DIM):
+                FP[i, j] += F[i, k] * P[k, j]
 
-    FP = F @ s.P
-    G = np.empty((DIM, DIM))
-    if not divide(P_ahead, FP, G):
+    if not divide_into(P_ahead, FP, Gt):
         return False
-    s.P[:] += G @ gained @ G.T
-    inject(now, G @ d)
-    return True
-
-
-@njit(cache=True)
-def divide(P: Array, A: Array, G: Array) -> bool:
-    """Fill G = Aᵀ P⁻¹ for a covariance P, by Cholesky of its correlations; False where P is none.
-
-    What has no variance, or none of its own, is left out of the inverse: there is nothing to smooth there.
-    """
-    n = len(P)
-    L, scale = np.zeros((n, n)), np.empty(n)
-    for i in range(n):
-        if not P[i, i] >= 0.0:
-            return False
-        scale[i] = 1.0 / math.sqrt(P[i, i]) if P[i, i] > 0.0 else 0.0
-    for i in range(n):
-        for j in range(i + 1):
-            total = P[i, j] * scale[i] * scale[j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i > j:
-                L[i, j] = total / L[j, j] if L[j, j] > 0.0 else 0.0
-            elif not total > -1e-9:
-                return False
-            else:
-                L[i, i] = math.sqrt(total) if total > 1e-14 else 0.0
-    x = np.empty(n)
-    for column in range(n):
-        for i in range(n):
-            total = A[i, column] * scale[i]
-            for k in range(i):
-                total -= L[i, k] * x[k]
-            x[i] = total / L[i, i] if L[i, i] > 0.0 else 0.0
-        for i in range(n - 1, -1, -1):
-            total = x[i]
-            for k in range(i + 1, n):
-                total -= L[k, i] * x[k]
-            x[i] = total / L[i, i] if L[i, i] > 0.0 else 0.0
-        for i in range(n):
-            G[column, i] = x[i] * scale[i]
+    left, step = FP, np.zeros(DIM)  # left: G (P^S − P⁻), in the memory of FP
+    for i in range(DIM):
+        for j in range(DIM):
+            step[i] += Gt[j, i] * d[j]
+            left[i, j] = 0.0
+            for k in range(DIM):
+                left[i, j] += Gt[k, i] * gained[k, j]
+    for i in range(DIM):
+        for j in range(DIM):
+            for k in range(DIM):
+                P[i, j] += left[i, k] * Gt[k, j]
+    inject(now, step)
     return True

@@ -1,7 +1,7 @@
 """The unscented Kalman filter on the manifold, with filterpy's sigma points and unscented transform.
 
 Sigma points are errors about the state that stands beside them, x ⊕ e. After each transform the mean error moves that
-state, and the covariance is turned into its new tangent as after any update (`eskf.inject`). The block of `imu` is
+state, and the covariance is turned into its new tangent as after any update (`state.inject`). The block of `imu` is
 integrated once, with the mean's biases, and carries all points, to first order in their difference in bias. Its noise
 Q is added (at the mean), as is a reading's.
 
@@ -16,18 +16,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from ...datasets.rig import Rig
-from ...datasets.state import DIM, THETA, Array, Belief
+from ...datasets.state import DIM, Array, Belief
 from ..interface import Diverged
+from ..physics.compiled import compiled
 from ..physics.imu import integrate, predict, process_noise
 from ..physics.measurements import measure
-from ..physics.so3 import exp, log, product
-from .eskf import inject
+from ..physics.state import inject, local, retract
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 
@@ -102,31 +101,7 @@ def _upper_root(P: Array) -> Array:
     return np.linalg.cholesky(P).T.astype(np.float64, copy=False)
 
 
-@njit(cache=True)
-def retract(state: NDArray[Any], error: Array, out: NDArray[Any]) -> None:
-    """Fill out = state ⊕ error, but for P."""
-    s, o = state[0], out[0]
-    o.R_WB[:] = product(s.R_WB, exp(error[THETA]))
-    for i in range(3):
-        o.p_WB_W[i] = s.p_WB_W[i] + error[3 + i]
-        o.v_WB_W[i] = s.v_WB_W[i] + error[6 + i]
-        o.b_a[i] = s.b_a[i] + error[9 + i]
-        o.b_g[i] = s.b_g[i] + error[12 + i]
-
-
-@njit(cache=True)
-def local(state: NDArray[Any], other: NDArray[Any], error: Array) -> None:
-    """Fill the error (15,) with state ⊕ error = other."""
-    s, o = state[0], other[0]
-    error[THETA] = log(product(s.R_WB.T, o.R_WB))
-    for i in range(3):
-        error[3 + i] = o.p_WB_W[i] - s.p_WB_W[i]
-        error[6 + i] = o.v_WB_W[i] - s.v_WB_W[i]
-        error[9 + i] = o.b_a[i] - s.b_a[i]
-        error[12 + i] = o.b_g[i] - s.b_g[i]
-
-
-@njit(cache=True)
+@compiled
 def carry_points(
     points: Array, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any],
     block: NDArray[Any], Q: Array,
@@ -145,7 +120,7 @@ def carry_points(
     return errors
 
 
-@njit(cache=True)
+@compiled
 def measure_points(
     points: Array, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]
 ) -> tuple[Array, Array]:
@@ -158,8 +133,9 @@ def measure_points(
         m = 0
         for reading in range(len(readings)):
             n = measure(readings, reading, point, rig, r, H, C)
-            residuals[k, m : m + n] = r[:n]
-            if k == 0:
-                C_all[m : m + n, m : m + n] = C[:n, :n]
+            for i in range(n):
+                residuals[k, m + i] = r[i]
+                for j in range(n):
+                    C_all[m + i, m + j] = C[i, j]
             m += n
     return residuals[:, :m].copy(), C_all[:m, :m].copy()

@@ -25,12 +25,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.state import Array, TimeArray
-from .imu import HELD_RATE
-from .so3 import exp, product, skew, transform
+from .blocks import clear, identity, set_product
+from .compiled import compiled
+from .imu import HELD_RATE, turn_by
+from .so3 import product_into, skew_into, transform_into
+from .state import POSITION_0, THETA_0
 
 DISPLACEMENT = np.dtype(
     [
@@ -44,7 +46,7 @@ DISPLACEMENT = np.dtype(
 )
 
 
-@njit(cache=True)
+@compiled
 def preintegrate_dvl(
     imu: NDArray[Any],
     start_ns: int,
@@ -75,66 +77,106 @@ def preintegrate_dvl(
     capacity = len(imu) + n
     position, turn, q = np.empty((capacity, 3)), np.empty((capacity, 3, 3)), np.empty(capacity)  # piece by piece
     weight = np.zeros((n, 3, 3))  # Σ ΔR Δt by reading
-    R, dp, k, piece = np.eye(3), np.zeros(3), 0, 0
-    now_ns = start_ns
+    vectors, matrices = np.zeros((4, 3)), np.zeros((6, 3, 3))
+    w_I, w, dp, u = vectors[0], vectors[1], vectors[2], vectors[3]
+    R, R_mid = matrices[0], matrices[1]
+    identity(R)
+    k, piece, now_ns = 0, 0, start_ns
     for row in range(len(imu)):
-        w = transform(g.R_BI, imu[row].w_WI_I - b_g)
-        while now_ns < imu[row].t_ns:
+        sample = imu[row]
+        for i in range(3):
+            w_I[i] = sample.w_WI_I[i] - b_g[i]
+        transform_into(g.R_BI, w_I, w)
+        while now_ns < sample.t_ns:
             while k + 1 < n and t_ns[k + 1] <= now_ns:
                 k += 1
-            until_ns = imu[row].t_ns
+            until_ns = sample.t_ns
             if k + 1 < n and t_ns[k + 1] < until_ns:
                 until_ns = t_ns[k + 1]
             if t_ns[k] > now_ns and t_ns[k] < until_ns:
                 until_ns = t_ns[k]
             dt = (until_ns - now_ns) * 1e-9
-            R_dt = dt * product(R, exp(0.5 * dt * w))
-            share = 0.0
+            share, ahead = 0.0, k  # of the next reading
             if straight and k + 1 < n and now_ns >= t_ns[k]:
-                share = (0.5 * (now_ns + until_ns) - t_ns[k]) / (t_ns[k + 1] - t_ns[k])
-            step = transform(R_dt, (1.0 - share) * v_WB_B[k])
-            weight[k] += (1.0 - share) * R_dt
-            if share > 0.0:
-                step += transform(R_dt, share * v_WB_B[k + 1])
-                weight[k + 1] += share * R_dt
-            position[piece], turn[piece] = dp + 0.5 * step, R_dt
-            q[piece] = (g.gyro_density**2 + HELD_RATE**2 * imu[row].held_s) * dt
+                share, ahead = (0.5 * (now_ns + until_ns) - t_ns[k]) / (t_ns[k + 1] - t_ns[k]), k + 1
+            for i in range(3):
+                for j in range(3):
+                    R_mid[i, j] = R[i, j]
+            turn_by(R_mid, w, 0.5 * dt)
+            for i in range(3):
+                step = 0.0
+                for j in range(3):
+                    R_dt = dt * R_mid[i, j]
+                    turn[piece, i, j] = R_dt
+                    weight[k, i, j] += (1.0 - share) * R_dt
+                    weight[ahead, i, j] += share * R_dt
+                    step += R_dt * ((1.0 - share) * v_WB_B[k, j] + share * v_WB_B[ahead, j])
+                position[piece, i] = dp[i] + 0.5 * step
+                dp[i] += step
+            q[piece] = (g.gyro_density**2 + HELD_RATE**2 * sample.held_s) * dt
             piece += 1
-            dp = dp + step
-            R = product(R, exp(dt * w))
+            turn_by(R, w, dt)
             now_ns = until_ns
 
-    out = np.zeros(1, DISPLACEMENT)
+    out = np.empty(1, DISPLACEMENT)
     d = out[0]
-    turned, u_turned, qu = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)  # Σ dt ΔR, Σ dt [u]× ΔR and Σ q u
-    N_pp = np.zeros((3, 3))
+    turned, u_turned, N_pp, S = matrices[2], matrices[3], matrices[4], matrices[5]  # Σ dt ΔR and Σ dt [u]× ΔR
+    N, qu, q_sum = d.N, w, 0.0  # Σ q u and Σ q
     for k in range(n):
         for i in range(3):
             for j in range(3):
                 for m in range(3):
                     N_pp[i, j] += weight[k, i, m] * sigma[k, m] ** 2 * weight[k, j, m]
+    for i in range(3):
+        qu[i] = 0.0
     for m in range(piece):
-        u = dp - position[m]
-        turned += turn[m]
-        u_turned += product(skew(u), turn[m])
-        qu += q[m] * u
-        N_pp += q[m] * ((u @ u) * np.eye(3) - np.outer(u, u))
+        uu = 0.0
+        for i in range(3):
+            u[i] = dp[i] - position[m, i]
+            qu[i] += q[m] * u[i]
+            uu += u[i] * u[i]
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            N_pp[i, i] += q[m] * uu
+            for j in range(3):
+                turned[i, j] += turn[m, i, j]
+                u_turned[i, j] += u[a] * turn[m, b, j] - u[b] * turn[m, a, j]
+                N_pp[i, j] -= q[m] * u[i] * u[j]
+        q_sum += q[m]
 
-    d.dR[:], d.dp[:], d.b_g[:] = R, dp, b_g
-    d.R_bg[:] = -product(R.T, product(turned, g.R_BI))
-    d.p_bg[:] = product(u_turned, g.R_BI)
-    d.N[0:3, 0:3] = q[:piece].sum() * np.eye(3)
-    d.N[0:3, 3:6], d.N[3:6, 0:3] = skew(qu), -skew(qu)
-    d.N[3:6, 3:6] = N_pp
+    product_into(turned, g.R_BI, S)
+    clear(N)
+    set_product(d.p_bg, 0, 0, 1.0, u_turned, g.R_BI)
+    for i in range(3):
+        d.dp[i], d.b_g[i] = dp[i], b_g[i]
+        for j in range(3):
+            d.dR[i, j], d.R_bg[i, j] = R[i, j], 0.0
+            for m in range(3):
+                d.R_bg[i, j] -= R[m, i] * S[m, j]
+    skew_into(qu, S)
+    for i in range(3):
+        N[THETA_0 + i, THETA_0 + i] = q_sum
+        for j in range(3):
+            N[THETA_0 + i, POSITION_0 + j], N[POSITION_0 + j, THETA_0 + i] = S[i, j], S[i, j]
+            N[POSITION_0 + i, POSITION_0 + j] = N_pp[i, j]
     return out
 
 
-@njit(cache=True)
+@compiled
 def given_rotation(N: Array) -> tuple[Array, Array]:
     """Return K (3, 3) m/rad and C (3, 3) m²: given φ, the error of Δp has mean K φ and covariance C.
 
     K = N_pφ N_φφ⁻¹ = −[ū]× and C = N_pp − K N_φp, N being that of a DISPLACEMENT. Gyro noise is isotropic, so N_φφ is
     a multiple of I; a perfect gyro has none, and then there is nothing to lay anywhere.
     """
-    K = N[3:, :3] / N[0, 0] if N[0, 0] > 0.0 else np.zeros((3, 3))
-    return K, N[3:, 3:] - product(K, N[:3, 3:])
+    K, C = np.zeros((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = N[POSITION_0 + i, POSITION_0 + j]
+            if N[THETA_0, THETA_0] > 0.0:
+                K[i, j] = N[POSITION_0 + i, THETA_0 + j] / N[THETA_0, THETA_0]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                C[i, j] -= K[i, k] * N[THETA_0 + k, POSITION_0 + j]
+    return K, C

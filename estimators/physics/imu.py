@@ -37,13 +37,24 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.epochs import IMU_SAMPLE
 from ...datasets.rig import Rig
-from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array
-from .so3 import cross, exp, exp_into, inverse_transform, product, product_into, right_jacobian, skew, transform
+from ...datasets.state import DIM, Array
+from .blocks import clear, identity, set_block, set_product
+from .compiled import compiled, inner
+from .so3 import (
+    cross_into,
+    exp_into,
+    inverse_transform_into,
+    product_into,
+    right_jacobian_into,
+    skew,
+    skew_into,
+    transform_into,
+)
+from .state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0
 
 HELD_RATE = 0.1
 """rad/s: how far the rate may stray, for the whole of a gap, from the sample that is held over it."""
@@ -65,17 +76,6 @@ RIG = np.dtype(
         ("w_CW_W", "f8", (3,)),  # the Earth's rate, rad/s; zero where its turning is left out
         ("rate_cov", "f8", (3, 3)),  # covariance of ω × l from the noise of one gyro sample, m²/s²
         ("inflate", "f8", (5,)),  # factor on sigma by kind of reading; inf: not used
-    ]
-)
-
-STATE = np.dtype(
-    [
-        ("R_WB", "f8", (3, 3)),
-        ("p_WB_W", "f8", (3,)),
-        ("v_WB_W", "f8", (3,)),
-        ("b_a", "f8", (3,)),
-        ("b_g", "f8", (3,)),
-        ("P", "f8", (15, 15)),
     ]
 )
 
@@ -121,7 +121,7 @@ def compile_rig(
     return record
 
 
-@njit(cache=True)
+@compiled
 def integrate(
     imu: NDArray[Any], before: NDArray[Any], b_a: Array, b_g: Array, rig: NDArray[Any], out: NDArray[Any]
 ) -> None:
@@ -136,30 +136,26 @@ def integrate(
             is (walk T / density)²/3 of it, less than 1e-3 for any IMU of note at T = 1 s.
     """
     g, block, n = rig[0], out[0], len(imu)
-    arm = g.p_BI_B
     R_mid, v_mid, p_mid = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3))  # at the middle of each sample
-    R, half, turn, push, drift = np.eye(3), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
-    v, p, w_x_f, T = np.zeros(3), np.zeros(3), np.empty(3), 0.0
+    R, half, vectors = np.empty((3, 3)), np.empty((3, 3)), np.zeros((7, 3))
+    turn, push, drift, v, p, c_i, c_j = (
+        vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5], vectors[6],
+    )  # fmt: skip
+    identity(R)
+    T = 0.0
     rates, forces, dts = unbiased(imu, before, b_a, b_g, g.R_BI)
     for k in range(n):
         dt = dts[k + 1]
-        slope = dt**3 / (6.0 * (dts[k] + dt)) if dt > 0.0 else 0.0  # dt²/12 where both samples last equally long
-        w0, f0, w, f = rates[k], forces[k], rates[k + 1], forces[k + 1]
+        increments(rates, forces, dts, k, turn, push, drift)
         for i in range(3):
-            w_x_f[i] = w[(i + 1) % 3] * f[(i + 2) % 3] - w[(i + 2) % 3] * f[(i + 1) % 3]
-        for i in range(3):
-            m, o = (i + 1) % 3, (i + 2) % 3
-            w_x_w_x_f = w[m] * w_x_f[o] - w[o] * w_x_f[m]
-            coning = w0[m] * w[o] - w0[o] * w[m]
-            sculling = w0[m] * f[o] - w0[o] * f[m] + f0[m] * w[o] - f0[o] * w[m]
-            turn[i] = 0.5 * (dt * w[i] + slope * coning)
-            push[i] = dt * f[i] + 0.5 * dt**2 * w_x_f[i] + dt**3 / 6.0 * w_x_w_x_f + slope * sculling
-            drift[i] = 0.5 * dt**2 * f[i] + dt**3 / 6.0 * w_x_f[i] + dt**4 / 24.0 * w_x_w_x_f
+            turn[i] *= 0.5
         exp_into(turn, half)
         product_into(R, half, R_mid[k])
         for i in range(3):
-            dv = R[i, 0] * push[0] + R[i, 1] * push[1] + R[i, 2] * push[2]
-            dp = R[i, 0] * drift[0] + R[i, 1] * drift[1] + R[i, 2] * drift[2]
+            dv, dp = 0.0, 0.0
+            for j in range(3):
+                dv += R[i, j] * push[j]
+                dp += R[i, j] * drift[j]
             v_mid[k, i] = v[i] + 0.5 * dv
             p_mid[k, i] = p[i] + 0.5 * dt * v[i] + 0.25 * dp
             p[i] += dt * v[i] + dp
@@ -167,15 +163,21 @@ def integrate(
         product_into(R_mid[k], half, R)
         T += dt
 
-    c_i, c_j = cross(rates[0], arm), cross(rates[n], arm)
-    v_end, p_end = v - transform(R, c_j), p - transform(R, arm)
-    block.T, block.dR[:], block.b_a[:], block.b_g[:], block.w_CW_W[:] = T, R, b_a, b_g, g.w_CW_W
-    block.dv[:] = v_end + c_i
-    block.dp[:] = p_end + T * c_i + arm
-    _spread(imu, R_mid, v_mid, p_mid, v_end, p_end, rig, out)
+    cross_into(rates[0], g.p_BI_B, c_i)
+    cross_into(rates[n], g.p_BI_B, c_j)
+    block.T = T
+    for i in range(3):  # from I to B: v and p are now of the block's end
+        for j in range(3):
+            block.dR[i, j] = R[i, j]
+            v[i] -= R[i, j] * c_j[j]
+            p[i] -= R[i, j] * g.p_BI_B[j]
+        block.b_a[i], block.b_g[i], block.w_CW_W[i] = b_a[i], b_g[i], g.w_CW_W[i]
+        block.dv[i] = v[i] + c_i[i]
+        block.dp[i] = p[i] + T * c_i[i] + g.p_BI_B[i]
+    _spread(imu, R_mid, v_mid, p_mid, v, p, rig, out)
 
 
-@njit(cache=True)
+@compiled
 def unbiased(
     imu: NDArray[Any], before: NDArray[Any], b_a: Array, b_g: Array, R_BI: Array
 ) -> tuple[Array, Array, Array]:
@@ -193,7 +195,33 @@ def unbiased(
     return rates, forces, dts
 
 
-@njit(cache=True)
+@compiled
+def increments(
+    rates: Array, forces: Array, dts: Array, k: int, turn: Array, push: Array, drift: Array
+) -> None:  # fmt: skip
+    """Fill what the k-th sample adds to the motion, in the axes of B at its beginning: the one step of integration.
+
+    Args:
+        rates, forces, dts: of `unbiased`; the sample stands in row k + 1, the one before it in row k.
+        turn: (3,) rad, rotation vector, with coning.
+        push: (3,) m/s, ∫ f dt, with sculling.
+        drift: (3,) m, ∬ f dt dt, without it.
+    """
+    w0, f0, w, f, dt = rates[k], forces[k], rates[k + 1], forces[k + 1], dts[k + 1]
+    slope = dt**3 / (6.0 * (dts[k] + dt)) if dt > 0.0 else 0.0  # dt²/12 where both samples last equally long
+    w_x_f = np.empty(3)
+    cross_into(w, f, w_x_f)
+    for i in range(3):
+        m, o = (i + 1) % 3, (i + 2) % 3
+        w_x_w_x_f = w[m] * w_x_f[o] - w[o] * w_x_f[m]
+        coning = w0[m] * w[o] - w0[o] * w[m]
+        sculling = w0[m] * f[o] - w0[o] * f[m] + f0[m] * w[o] - f0[o] * w[m]
+        turn[i] = dt * w[i] + slope * coning
+        push[i] = dt * f[i] + 0.5 * dt**2 * w_x_f[i] + dt**3 / 6.0 * w_x_w_x_f + slope * sculling
+        drift[i] = 0.5 * dt**2 * f[i] + dt**3 / 6.0 * w_x_f[i] + dt**4 / 24.0 * w_x_w_x_f
+
+
+@inner
 def _spread(
     imu: NDArray[Any], R_mid: Array, v_mid: Array, p_mid: Array, v_end: Array, p_end: Array,
     rig: NDArray[Any], out: NDArray[Any],
@@ -210,33 +238,28 @@ def _spread(
         cov(Δv, Δp) = Σ q [u]× [w]×ᵀ = Σ q (u·w I − w uᵀ),        cov(φ, Δv) = Σ q [u]×,        and so on.
     """
     g, block, n = rig[0], out[0], len(imu)
-    R, T, N = block.dR, block.T, block.N
-    turned, lifted = np.zeros((3, 3)), np.zeros((3, 3))  # Σ dt ΔR and Σ dt (T − s) ΔR
-    u_turned, w_turned = np.zeros((3, 3)), np.zeros((3, 3))  # Σ dt [u]× ΔR and Σ dt [w]× ΔR
-    u, w, s_u, s_w = np.empty(3), np.empty(3), np.zeros(3), np.zeros(3)
+    T, N = block.T, block.N
+    matrices, vectors = np.zeros((6, 3, 3)), np.zeros((4, 3))
+    turned, lifted = matrices[0], matrices[1]  # Σ dt ΔR and Σ dt (T − s) ΔR
+    u_turned, w_turned = matrices[2], matrices[3]  # Σ dt [u]× ΔR and Σ dt [w]× ΔR
+    S, L_BI = matrices[4], matrices[5]
+    u, w, s_u, s_w = vectors[0], vectors[1], vectors[2], vectors[3]
     gyro = accel = accel_1 = accel_2 = uu = uw = ww = 0.0  # Σ q, and Σ q_a (T − s)^0, 1, 2, Σ q u·u, ...
-    N[:] = 0.0
+    clear(N)
     remains = T
     for k in range(n):
-        dt, held = imu[k].dt_s, imu[k].held_s
+        dt, held, R = imu[k].dt_s, imu[k].held_s, R_mid[k]
         remains -= 0.5 * dt  # now T − s, s being the middle of the sample
         for i in range(3):
             u[i] = v_end[i] - v_mid[k, i]
             w[i] = p_end[i] - p_mid[k, i] - remains * v_mid[k, i]
-        for j in range(3):
-            x, y, z = dt * R_mid[k, 0, j], dt * R_mid[k, 1, j], dt * R_mid[k, 2, j]
-            turned[0, j] += x
-            turned[1, j] += y
-            turned[2, j] += z
-            lifted[0, j] += remains * x
-            lifted[1, j] += remains * y
-            lifted[2, j] += remains * z
-            u_turned[0, j] += u[1] * z - u[2] * y
-            u_turned[1, j] += u[2] * x - u[0] * z
-            u_turned[2, j] += u[0] * y - u[1] * x
-            w_turned[0, j] += w[1] * z - w[2] * y
-            w_turned[1, j] += w[2] * x - w[0] * z
-            w_turned[2, j] += w[0] * y - w[1] * x
+        for i in range(3):
+            m, o = (i + 1) % 3, (i + 2) % 3
+            for j in range(3):
+                turned[i, j] += dt * R[i, j]
+                lifted[i, j] += dt * remains * R[i, j]
+                u_turned[i, j] += dt * (u[m] * R[o, j] - u[o] * R[m, j])
+                w_turned[i, j] += dt * (w[m] * R[o, j] - w[o] * R[m, j])
 
         q = g.gyro_density**2 * dt + HELD_RATE**2 * held * dt  # sums to (HELD_RATE gap)², however the gap is split
         q_a = g.accel_density**2 * dt + HELD_ACCEL**2 * held * dt
@@ -251,30 +274,41 @@ def _spread(
             s_u[i] += q * u[i]
             s_w[i] += q * w[i]
             for j in range(3):
-                N[3 + i, 3 + j] -= q * w[i] * w[j]
-                N[3 + i, 6 + j] -= q * u[i] * w[j]
-                N[6 + i, 6 + j] -= q * u[i] * u[j]
+                N[POSITION_0 + i, POSITION_0 + j] -= q * w[i] * w[j]
+                N[POSITION_0 + i, VELOCITY_0 + j] -= q * u[i] * w[j]
+                N[VELOCITY_0 + i, VELOCITY_0 + j] -= q * u[i] * u[j]
         remains -= 0.5 * dt
 
     for i in range(3):
-        N[i, i] = gyro
-        N[3 + i, 3 + i] += ww + accel_2
-        N[3 + i, 6 + i] += uw + accel_1
-        N[6 + i, 6 + i] += uu + accel
-    N[0:3, 3:6] = skew(s_w)
-    N[0:3, 6:9] = skew(s_u)
-    N[3:6, 0:3], N[6:9, 0:3], N[6:9, 3:6] = N[0:3, 3:6].T, N[0:3, 6:9].T, N[3:6, 6:9].T
+        N[THETA_0 + i, THETA_0 + i] = gyro
+        N[POSITION_0 + i, POSITION_0 + i] += ww + accel_2
+        N[POSITION_0 + i, VELOCITY_0 + i] += uw + accel_1
+        N[VELOCITY_0 + i, VELOCITY_0 + i] += uu + accel
+    skew_into(s_w, S)
+    set_block(N, THETA_0, POSITION_0, 1.0, S)
+    skew_into(s_u, S)
+    set_block(N, THETA_0, VELOCITY_0, 1.0, S)
+    for i in range(len(N)):
+        for j in range(3 * (i // 3)):
+            N[i, j] = N[j, i]
 
-    L_BI = product(skew(g.p_BI_B), g.R_BI)  # ω = R_BI (w − b_g), and d(ω × l) = [l]× R_BI d
-    turned_BI = product(turned, g.R_BI)
-    block.R_bg[:] = -product(R.T, turned_BI)
-    block.v_ba[:], block.p_ba[:] = -turned_BI, -product(lifted, g.R_BI)
-    block.v_bg[:] = product(u_turned, g.R_BI) + L_BI - product(R, L_BI)
-    block.p_bg[:] = product(w_turned, g.R_BI) + T * L_BI
+    skew_into(g.p_BI_B, S)
+    product_into(S, g.R_BI, L_BI)  # ω = R_BI (w − b_g), and d(ω × l) = [l]× R_BI d
+    product_into(turned, g.R_BI, S)  # from here on S is Σ dt ΔR R_BI
+    for i in range(3):
+        for j in range(3):
+            block.v_ba[i, j] = -S[i, j]
+            block.R_bg[i, j], block.p_ba[i, j] = 0.0, 0.0
+            block.v_bg[i, j], block.p_bg[i, j] = L_BI[i, j], T * L_BI[i, j]
+            for m in range(3):
+                block.R_bg[i, j] -= block.dR[m, i] * S[m, j]
+                block.p_ba[i, j] -= lifted[i, m] * g.R_BI[m, j]
+                block.v_bg[i, j] += u_turned[i, m] * g.R_BI[m, j] - block.dR[i, m] * L_BI[m, j]
+                block.p_bg[i, j] += w_turned[i, m] * g.R_BI[m, j]
     block.bias_walk[0], block.bias_walk[1] = g.accel_walk**2 * T, g.gyro_walk**2 * T
 
 
-@njit(cache=True)
+@compiled
 def predict(block: NDArray[Any], state: NDArray[Any], gravity: float, F: Array, out: NDArray[Any]) -> None:
     """Carry a state over a block, to first order in the change of its biases since the block was integrated.
 
@@ -283,41 +317,64 @@ def predict(block: NDArray[Any], state: NDArray[Any], gravity: float, F: Array, 
         state: STATE record of length 1, at the block's start; its P is not read.
         gravity: m/s², positive.
         F: (15, 15), filled with the derivative of the end's error by the start's.
-        out: STATE record of length 1, filled but for P.
+        out: STATE record of length 1, filled but for P; may be `state`.
     """
     b, s, e = block[0], state[0], out[0]
     T, R_i = b.T, s.R_WB
-    d_a, d_g = s.b_a - b.b_a, s.b_g - b.b_g
-    phi = transform(b.R_bg, d_g)
-    dR = product(b.dR, exp(phi))
-    dv = b.dv + transform(b.v_ba, d_a) + transform(b.v_bg, d_g)
-    dp = b.dp + transform(b.p_ba, d_a) + transform(b.p_bg, d_g)
-
-    F[:] = 0.0
-    F[THETA, THETA] = dR.T
-    F[THETA, GYRO_BIAS] = product(right_jacobian(phi), b.R_bg)
-    F[POSITION, THETA] = -product(R_i, skew(dp))
-    F[POSITION, ACCEL_BIAS] = product(R_i, b.p_ba)
-    F[POSITION, GYRO_BIAS] = product(R_i, b.p_bg)
-    F[VELOCITY, THETA] = -product(R_i, skew(dv))
-    F[VELOCITY, ACCEL_BIAS] = product(R_i, b.v_ba)
-    F[VELOCITY, GYRO_BIAS] = product(R_i, b.v_bg)
+    vectors, matrices = np.empty((7, 3)), np.empty((4, 3, 3))
+    d_a, d_g, phi, dv, dp = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
+    p_j, v_j = vectors[5], vectors[6]
+    turn, dR, R_j, S = matrices[0], matrices[1], matrices[2], matrices[3]
     for i in range(3):
-        F[3 + i, 3 + i] = F[6 + i, 6 + i] = F[9 + i, 9 + i] = F[12 + i, 12 + i] = 1.0
-        F[3 + i, 6 + i] = T
+        d_a[i], d_g[i] = s.b_a[i] - b.b_a[i], s.b_g[i] - b.b_g[i]
+    transform_into(b.R_bg, d_g, phi)
+    exp_into(phi, turn)
+    product_into(b.dR, turn, dR)
+    for i in range(3):
+        dv[i], dp[i] = b.dv[i], b.dp[i]
+        for j in range(3):
+            dv[i] += b.v_ba[i, j] * d_a[j] + b.v_bg[i, j] * d_g[j]
+            dp[i] += b.p_ba[i, j] * d_a[j] + b.p_bg[i, j] * d_g[j]
 
-    p_j = s.p_WB_W + T * s.v_WB_W + transform(R_i, dp)
-    v_j = s.v_WB_W + transform(R_i, dv)
+    identity(F)
+    for i in range(3):
+        for j in range(3):
+            F[THETA_0 + i, THETA_0 + j] = dR[j, i]
+        F[POSITION_0 + i, VELOCITY_0 + i] = T
+    right_jacobian_into(phi, S)
+    set_product(F, THETA_0, GYRO_BIAS_0, 1.0, S, b.R_bg)
+    skew_into(dp, S)
+    set_product(F, POSITION_0, THETA_0, -1.0, R_i, S)
+    set_product(F, POSITION_0, ACCEL_BIAS_0, 1.0, R_i, b.p_ba)
+    set_product(F, POSITION_0, GYRO_BIAS_0, 1.0, R_i, b.p_bg)
+    skew_into(dv, S)
+    set_product(F, VELOCITY_0, THETA_0, -1.0, R_i, S)
+    set_product(F, VELOCITY_0, ACCEL_BIAS_0, 1.0, R_i, b.v_ba)
+    set_product(F, VELOCITY_0, GYRO_BIAS_0, 1.0, R_i, b.v_bg)
+
+    product_into(R_i, dR, R_j)
+    transform_into(R_i, dp, p_j)
+    transform_into(R_i, dv, v_j)
+    for i in range(3):
+        p_j[i] += s.p_WB_W[i] + T * s.v_WB_W[i]
+        v_j[i] += s.v_WB_W[i]
     p_j[2] -= 0.5 * gravity * T * T
     v_j[2] -= gravity * T
-    R_j = product(R_i, dR)
-    if b.w_CW_W.any():
+    if turns(b.w_CW_W):
         turn_world(b.w_CW_W, T, gravity, s.p_WB_W, R_j, p_j, v_j, F)
-    e.R_WB[:] = R_j
-    e.p_WB_W[:], e.v_WB_W[:], e.b_a[:], e.b_g[:] = p_j, v_j, s.b_a, s.b_g
+    for i in range(3):
+        for j in range(3):
+            e.R_WB[i, j] = R_j[i, j]
+        e.p_WB_W[i], e.v_WB_W[i], e.b_a[i], e.b_g[i] = p_j[i], v_j[i], s.b_a[i], s.b_g[i]
 
 
-@njit(cache=True)
+@inner
+def turns(w_CW_W: Array) -> bool:
+    """Whether W turns with the Earth."""
+    return w_CW_W[0] != 0.0 or w_CW_W[1] != 0.0 or w_CW_W[2] != 0.0
+
+
+@inner
 def turn_world(
     w_CW_W: Array, T: float, gravity: float, p_i: Array, R_j: Array, p_j: Array, v_j: Array, F: Array
 ) -> None:
@@ -325,20 +382,47 @@ def turn_world(
 
     The error theta is on the right of R, where E does not touch it; of p and v, E u and all else is linear.
     """
-    E = exp(-T * w_CW_W)
-    w_x_g = cross(w_CW_W, np.array([0.0, 0.0, -gravity]))
-    w_x_w_x_g = cross(w_CW_W, w_x_g)
-    u = transform(E, p_j - p_i + T**3 / 6.0 * w_x_g + T**4 / 24.0 * w_x_w_x_g)
-    v = transform(E, v_j + T**2 / 2.0 * w_x_g + T**3 / 6.0 * w_x_w_x_g)
-    R_j[:], p_j[:], v_j[:] = product(E, R_j), p_i + u, v - cross(w_CW_W, u)
-    for j in range(15):
-        if j < 3 or j >= 6:  # by p_i, p_j changes as it did, and v_j not at all
-            of_u = transform(E, F[POSITION, j])
-            F[VELOCITY, j] = transform(E, F[VELOCITY, j]) - cross(w_CW_W, of_u)
-            F[POSITION, j] = of_u
+    vectors, E, R = np.empty((6, 3)), np.empty((3, 3)), R_j.copy()
+    a, w_x_g, w_x_w_x_g, u, v, w_x_u = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
+    for i in range(3):
+        a[i] = -T * w_CW_W[i]
+    exp_into(a, E)
+    product_into(E, R, R_j)
+    a[0], a[1], a[2] = 0.0, 0.0, -gravity
+    cross_into(w_CW_W, a, w_x_g)
+    cross_into(w_CW_W, w_x_g, w_x_w_x_g)
+    for i in range(3):
+        a[i] = p_j[i] - p_i[i] + T**3 / 6.0 * w_x_g[i] + T**4 / 24.0 * w_x_w_x_g[i]
+    transform_into(E, a, u)
+    for i in range(3):
+        a[i] = v_j[i] + T**2 / 2.0 * w_x_g[i] + T**3 / 6.0 * w_x_w_x_g[i]
+    transform_into(E, a, v)
+    cross_into(w_CW_W, u, w_x_u)
+    for i in range(3):
+        p_j[i], v_j[i] = p_i[i] + u[i], v[i] - w_x_u[i]
+    for j in range(DIM):
+        if POSITION_0 <= j < VELOCITY_0:  # by p_i, p_j changes as it did, and v_j not at all
+            continue
+        for i in range(3):
+            a[i], w_x_g[i] = F[POSITION_0 + i, j], F[VELOCITY_0 + i, j]
+        transform_into(E, a, u)
+        transform_into(E, w_x_g, v)
+        cross_into(w_CW_W, u, w_x_u)
+        for i in range(3):
+            F[POSITION_0 + i, j], F[VELOCITY_0 + i, j] = u[i], v[i] - w_x_u[i]
 
 
-@njit(cache=True)
+@compiled
+def turn_by(R: Array, w: Array, dt: float) -> None:
+    """R ← R Exp(w dt), in place."""
+    phi, turn, old = np.empty(3), np.empty((3, 3)), R.copy()
+    for i in range(3):
+        phi[i] = w[i] * dt
+    exp_into(phi, turn)
+    product_into(old, turn, R)
+
+
+@compiled
 def over_world(imu: NDArray[Any], R_i: Array, b_g: Array, rig: NDArray[Any]) -> NDArray[Any]:
     """Return IMU_SAMPLE rows with the rates over W alone, less R_IW w_CW_W of the Earth that the gyro senses as well.
 
@@ -348,57 +432,83 @@ def over_world(imu: NDArray[Any], R_i: Array, b_g: Array, rig: NDArray[Any]) -> 
         b_g: (3,) gyro bias, rad/s; it stays in the rates.
         rig: RIG record of length 1.
     """
-    g, R = rig[0], R_i.copy()
-    if not g.w_CW_W.any():
+    g, R, R_mid = rig[0], R_i.copy(), np.empty((3, 3))
+    if not turns(g.w_CW_W):
         return imu
-    rows = imu.copy()
+    rows, vectors = imu.copy(), np.empty((4, 3))
+    w_I, w_B, w_CW_B, w_CW_I = vectors[0], vectors[1], vectors[2], vectors[3]
     for k in range(len(rows)):
-        w_CB_B, dt = transform(g.R_BI, rows[k].w_WI_I - b_g), rows[k].dt_s
-        w_CW_B = inverse_transform(product(R, exp(0.5 * dt * w_CB_B)), g.w_CW_W)
-        rows[k].w_WI_I[:] -= inverse_transform(g.R_BI, w_CW_B)
-        R = product(R, exp(dt * (w_CB_B - w_CW_B)))
+        row = rows[k]
+        for i in range(3):
+            w_I[i] = row.w_WI_I[i] - b_g[i]
+        transform_into(g.R_BI, w_I, w_B)
+        for i in range(3):
+            for j in range(3):
+                R_mid[i, j] = R[i, j]
+        turn_by(R_mid, w_B, 0.5 * row.dt_s)
+        inverse_transform_into(R_mid, g.w_CW_W, w_CW_B)
+        inverse_transform_into(g.R_BI, w_CW_B, w_CW_I)
+        for i in range(3):
+            row.w_WI_I[i] -= w_CW_I[i]
+            w_B[i] -= w_CW_B[i]
+        turn_by(R, w_B, row.dt_s)
     return rows
 
 
-@njit(cache=True)
+@compiled
 def process_noise(block: NDArray[Any], R_i: Array, Q: Array) -> None:
     """Fill Q (15, 15): what the block's noise adds to the error covariance at its end; R_i is R_WB at its start.
 
-    How W turns meanwhile is left out: it is 1e-4 of Q.
+    It is G N Gᵀ of the block's N, with G = diag(ΔRᵀ, R_i, R_i). How W turns meanwhile is left out: it is 1e-4 of Q.
     """
     b = block[0]
-    Q[:] = 0.0
-    G = (b.dR.T.copy(), R_i.copy(), R_i.copy())
+    G, GN = np.empty((3, 3, 3)), np.empty((9, 9))
     for i in range(3):
         for j in range(3):
-            N_ij = b.N[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
-            Q[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = product(product(G[i], N_ij), G[j].T)
-    for i in range(3):
-        Q[9 + i, 9 + i] = b.bias_walk[0]
-        Q[12 + i, 12 + i] = b.bias_walk[1]
-
-
-@njit(cache=True)
-def sandwich(F: Array, P: Array) -> Array:
-    """F P Fᵀ for an F of `predict`, whose lower 6 rows are (0, I); symmetric to the last bit."""
-    FP = np.empty((15, 15))
+            G[0, i, j], G[1, i, j], G[2, i, j] = b.dR[j, i], R_i[i, j], R_i[i, j]
     for i in range(9):
-        for j in range(15):
+        for j in range(9):
             total = 0.0
-            for k in range(15):
+            for k in range(3):
+                total += G[i // 3, i % 3, k] * b.N[i - i % 3 + k, j]
+            GN[i, j] = total
+    clear(Q)
+    for i in range(9):
+        for j in range(9):
+            total = 0.0
+            for k in range(3):
+                total += GN[i, j - j % 3 + k] * G[j // 3, j % 3, k]
+            Q[i, j] = total
+    for i in range(3):
+        Q[ACCEL_BIAS_0 + i, ACCEL_BIAS_0 + i] = b.bias_walk[0]
+        Q[GYRO_BIAS_0 + i, GYRO_BIAS_0 + i] = b.bias_walk[1]
+
+
+@compiled
+def sandwich(F: Array, P: Array, Q: Array, out: Array) -> None:
+    """Fill out = F P Fᵀ + Q for an F of `predict`, whose bias rows are (0, I); symmetric to the last bit.
+
+    All are (15, 15); `out` may be P or Q.
+    """
+    FP = np.empty((DIM, DIM))
+    for i in range(ACCEL_BIAS_0):
+        for j in range(DIM):
+            total = 0.0
+            for k in range(DIM):
                 total += F[i, k] * P[k, j]
             FP[i, j] = total
-    FP[9:] = P[9:]
-    out = np.empty((15, 15))
-    for i in range(15):
-        for j in range(min(i + 1, 9)):
+    for i in range(ACCEL_BIAS_0, DIM):
+        for j in range(DIM):
+            FP[i, j] = P[i, j]
+    for i in range(DIM):
+        for j in range(i + 1):
             total = 0.0
-            for k in range(15):
-                total += FP[i, k] * F[j, k]
-            out[i, j] = out[j, i] = total
-        for j in range(9, i + 1):
-            out[i, j] = out[j, i] = FP[i, j]
-    return out
+            if j < ACCEL_BIAS_0:
+                for k in range(DIM):
+                    total += FP[i, k] * F[j, k]
+            else:
+                total = FP[i, j]
+            out[i, j] = out[j, i] = total + 0.5 * (Q[i, j] + Q[j, i])
 
 
 def first_sample(imu: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
@@ -416,3 +526,16 @@ def first_sample(imu: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
         for name in ("w_WI_I", "f_I"):
             row[name] = 1.5 * imu[name][0] - 0.5 * imu[name][1]
     return row
+
+
+def split(imu: NDArray[Any], t_ns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Split IMU_SAMPLE rows at t_ns; a sample that straddles it becomes two of the same rates."""
+    k = int(np.searchsorted(imu["t_ns"], t_ns, side="right"))
+    head, tail = imu[:k], imu[k:]
+    if len(tail):
+        began_ns = int(tail["t_ns"][0]) - round(float(tail["dt_s"][0]) * 1e9)
+        if began_ns < t_ns:
+            head, tail = np.concatenate([head, tail[:1]]), tail.copy()
+            head["dt_s"][-1], tail["dt_s"][0] = (t_ns - began_ns) * 1e-9, (int(tail["t_ns"][0]) - t_ns) * 1e-9
+            head["t_ns"][-1] = t_ns
+    return head, tail

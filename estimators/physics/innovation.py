@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.epochs import SENSOR
 from ...datasets.state import DIM, Array, Belief
+from .compiled import compiled
+from .elimination import normalised_square, project
 from .measurements import measure
-from .records import as_record
+from .state import as_record
 
 INNOVATION = np.dtype(
     [
@@ -60,29 +61,19 @@ def innovations(belief: Belief, readings: NDArray[Any], rig: NDArray[Any]) -> ND
     return table[table["dof"] > 0]
 
 
-@njit(cache=True)
+@compiled
 def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table: NDArray[Any]) -> None:
     """Fill dof and nis of a table of INNOVATION rows, one per reading; state and rig are records of length 1."""
-    r, H, C = np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
+    r, H, S, PH = np.empty(3), np.empty((3, DIM)), np.empty((3, 3)), np.empty(DIM)
     for m in range(len(readings)):
-        n = measure(readings, m, state, rig, r, H, C)
-        if n == 0 or not H[:n].any():  # a yaw looked at from the pole measures nothing
-            continue
-        S = H[:n] @ state[0].P @ H[:n].T + C[:n, :n]
-        table[m].dof, table[m].nis = n, normalised_square(r[:n], S)
-
-
-@njit(cache=True)
-def normalised_square(r: NDArray[Any], S: NDArray[Any]) -> float:
-    """Return rᵀ S⁻¹ r for n components r, by elimination; NaN where S (n, n) is not positive. Both are used up."""
-    total = 0.0
-    for k in range(len(r)):
-        if not S[k, k] > 0.0:
-            return np.nan
-        total += r[k] ** 2 / S[k, k]
-        for i in range(k + 1, len(r)):
-            share = S[i, k] / S[k, k]
-            r[i] -= share * r[k]
-            for j in range(k + 1, len(r)):
-                S[i, j] -= share * S[k, j]
-    return total
+        n, largest = measure(readings, m, state, rig, r, H, S), 0.0
+        for i in range(n):
+            S[i, i] = project(H[i], state[0].P, S[i, i], PH)
+            for j in range(DIM):
+                largest = max(largest, abs(H[i, j]))
+                for k in range(i):
+                    S[i, k] += H[k, j] * PH[j]
+            for k in range(i):
+                S[k, i] = S[i, k]
+        if largest > 0.0:  # a yaw looked at from the pole measures nothing
+            table[m].dof, table[m].nis = n, normalised_square(n, r, H, S)

@@ -1,7 +1,7 @@
 """What each sensor says of the state: one residual and one Jacobian per sensor, for every estimator.
 
 Every residual is h(x) ⊖ z, and H is its derivative by the error state (15) of `datasets.state`, exactly of what is
-returned. Numbers in brackets are the equations of DESIGN, section 3.
+filled in. Numbers in brackets are the equations of DESIGN, section 3.
 """
 
 from __future__ import annotations
@@ -9,110 +9,135 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
+import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
-from ...datasets.state import GYRO_BIAS, POSITION, THETA, VELOCITY, Array
+from ...datasets.state import Array
+from .blocks import clear, set_block, set_product
+from .compiled import compiled, inner
 from .so3 import (
+    between,
     exp,
     inverse_right_jacobian,
-    inverse_transform,
+    inverse_transform_into,
     log,
+    log_into,
     product,
+    product_into,
     right_jacobian,
-    skew,
-    transform,
+    skew_into,
+    transform_into,
     wrap,
     yaw_of,
 )
+from .state import GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0
 
 
-@njit(cache=True)
-def depth_residual(R_WB: Array, p_WB_W: Array, p_BP_B: Array, z_m: float, H: Array) -> float:
+@inner
+def position_residual(R_WB: Array, p_WB_W: Array, p_BS_B: Array, p_WS_W: Array, r: Array, H: Array) -> None:
+    """r(x) = p_WB_W + R_WB p_BS_B − p_WS_W                                         [eq. 2]
+
+    For a sensor S at a lever arm: a GPS antenna. Fills r (3,) m and H (3, 15).
+    """
+    S = np.empty((3, 3))
+    skew_into(p_BS_B, S)
+    clear(H)
+    set_product(H, 0, THETA_0, -1.0, R_WB, S)
+    transform_into(R_WB, p_BS_B, r)
+    for i in range(3):
+        H[i, POSITION_0 + i] = 1.0
+        r[i] += p_WB_W[i] - p_WS_W[i]
+
+
+@inner
+def depth_residual(R_WB: Array, p_WB_W: Array, p_BP_B: Array, z_m: float, r: Array, H: Array) -> None:
     """r(x) = (p_WB_W + R_WB p_BP_B) · e_z − z_m                                    [eq. 1]
 
-    Returns r (m) and fills H (1, 15).
+    Fills row 0 of r, m, and of H: the last one of `position_residual`.
     """
-    H[:] = 0.0
-    H[0, 0] = -R_WB[2, 1] * p_BP_B[2] + R_WB[2, 2] * p_BP_B[1]  # −(R_WB [p_BP_B]×), its last row
-    H[0, 1] = R_WB[2, 0] * p_BP_B[2] - R_WB[2, 2] * p_BP_B[0]
-    H[0, 2] = -R_WB[2, 0] * p_BP_B[1] + R_WB[2, 1] * p_BP_B[0]
-    H[0, 5] = 1.0
-    return p_WB_W[2] + R_WB[2, 0] * p_BP_B[0] + R_WB[2, 1] * p_BP_B[1] + R_WB[2, 2] * p_BP_B[2] - z_m
+    clear(H)
+    r[0] = p_WB_W[2] - z_m
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        H[0, THETA_0 + i] = R_WB[2, k] * p_BP_B[j] - R_WB[2, j] * p_BP_B[k]  # −(R_WB [p_BP_B]×), its last row
+        r[0] += R_WB[2, i] * p_BP_B[i]
+    H[0, POSITION_0 + 2] = 1.0
 
 
-@njit(cache=True)
-def gps_residual(R_WB: Array, p_WB_W: Array, p_BG_B: Array, p_WG_W: Array, H: Array) -> Array:
-    """r(x) = p_WB_W + R_WB p_BG_B − p_WG_W                                         [eq. 2]
-
-    Returns r (3,) m and fills H (3, 15).
-    """
-    H[:] = 0.0
-    H[:, THETA] = -product(R_WB, skew(p_BG_B))
-    H[0, 3] = H[1, 4] = H[2, 5] = 1.0
-    return p_WB_W + transform(R_WB, p_BG_B) - p_WG_W
-
-
-@njit(cache=True)
-def attitude_residual(R_WB: Array, R_BH: Array, R_WH: Array, H: Array) -> Array:
+@inner
+def attitude_residual(R_WB: Array, R_BH: Array, R_WH: Array, r: Array, H: Array) -> None:
     """r(x) = Log((R_WH R_BH⁻¹)⁻¹ R_WB)                                             [eq. 3]
 
-    For a sensor that gives a full attitude R_WH. Returns r (3,) rad, in B, and fills H (3, 15).
+    For a sensor that gives a full attitude R_WH (9,), by rows. Fills r (3,) rad, in B, and H (3, 15).
     """
-    r = log(product(product(R_BH, R_WH.T), R_WB))
-    H[:] = 0.0
-    H[:, THETA] = inverse_right_jacobian(r)
-    return r
+    missed, R_HB = np.empty((3, 3)), np.empty((3, 3))  # R_HB: by the sensor's attitude and the state's
+    for i in range(3):
+        for j in range(3):
+            R_HB[i, j] = R_WH[i] * R_WB[0, j] + R_WH[3 + i] * R_WB[1, j] + R_WH[6 + i] * R_WB[2, j]
+    product_into(R_BH, R_HB, missed)
+    log_into(missed, r)
+    clear(H)
+    set_block(H, 0, THETA_0, 1.0, inverse_right_jacobian(r))
 
 
-@njit(cache=True)
-def yaw_residual(R_WB: Array, R_BH: Array, yaw_rad: float, H: Array) -> float:
+@inner
+def yaw_residual(R_WB: Array, R_BH: Array, yaw_rad: float, r: Array, H: Array) -> None:
     """r(x) = yaw(R_WB R_BH) − yaw_rad, wrapped                                     [the heading-only form of eq. 3]
 
     By the heading sensor's own rotation its derivative is (0, sin φ / cos θ, cos φ / cos θ), with φ, θ its roll and
-    pitch. Within 2° of its x axis being vertical a yaw says nothing: r and H are zero there. Returns r (rad) and fills
-    H (1, 15).
+    pitch. Within 2° of its x axis being vertical a yaw says nothing: r and H are zero there. Fills row 0 of r, rad, and
+    of H.
     """
     R_WH = product(R_WB, R_BH)
     # cos θ sin φ = R[2,1], cos θ cos φ = R[2,2], and cos² θ = R[0,0]² + R[1,0]²
     cos2 = R_WH[0, 0] ** 2 + R_WH[1, 0] ** 2
-    H[:] = 0.0
-    if cos2 < 1e-3:
-        return 0.0
-    for i in range(3):
-        H[0, i] = (R_BH[i, 1] * R_WH[2, 1] + R_BH[i, 2] * R_WH[2, 2]) / cos2
-    return wrap(yaw_of(R_WH) - yaw_rad)
+    clear(H)
+    r[0] = 0.0
+    if cos2 >= 1e-3:
+        for i in range(3):
+            H[0, THETA_0 + i] = (R_BH[i, 1] * R_WH[2, 1] + R_BH[i, 2] * R_WH[2, 2]) / cos2
+        r[0] = wrap(yaw_of(R_WH) - yaw_rad)
 
 
-@njit(cache=True)
-def dvl_residual(R_WB: Array, v_WB_W: Array, v_WB_B: Array, H: Array) -> Array:
+@inner
+def dvl_residual(R_WB: Array, v_WB_W: Array, v_WB_B: Array, r: Array, H: Array) -> None:
     """r(x) = R_WBᵀ v_WB_W − v_WB_B                                                 [eq. 4]
 
-    Returns r (3,) m/s and fills H (3, 15).
+    Fills r (3,) m/s and H (3, 15).
     """
-    predicted = inverse_transform(R_WB, v_WB_W)
-    H[:] = 0.0
-    H[:, THETA] = skew(predicted)
-    H[:, VELOCITY] = R_WB.T
-    return predicted - v_WB_B
+    inverse_transform_into(R_WB, v_WB_W, r)
+    clear(H)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        H[k, THETA_0 + j], H[j, THETA_0 + k] = r[i], -r[i]  # [R_WBᵀ v_WB_W]×
+        for m in range(3):
+            H[i, VELOCITY_0 + m] = R_WB[m, i]
+    for i in range(3):
+        r[i] -= v_WB_B[i]
 
 
-@njit(cache=True)
+@compiled
 def preintegrated_dvl_residual(R_i: Array, p_i: Array, p_j: Array, dp_ij: Array, H_i: Array, H_j: Array) -> Array:
     """r(x_i, x_j) = R_iᵀ (p_j − p_i) − Δp̃_ij                                       [eq. 6]
 
     Returns r (3,) m and fills H_i and H_j, both (3, 15).
     """
-    moved = inverse_transform(R_i, p_j - p_i)
-    H_i[:], H_j[:] = 0.0, 0.0
-    H_i[:, THETA] = skew(moved)
-    H_i[:, POSITION] = -R_i.T
-    H_j[:, POSITION] = R_i.T
-    return moved - dp_ij
+    r, S = np.empty(3), np.empty((3, 3))
+    inverse_transform_into(R_i, p_j - p_i, r)
+    skew_into(r, S)
+    clear(H_i)
+    clear(H_j)
+    set_block(H_i, 0, THETA_0, 1.0, S)
+    for i in range(3):
+        r[i] -= dp_ij[i]
+        for j in range(3):
+            H_i[i, POSITION_0 + j] = -R_i[j, i]
+            H_j[i, POSITION_0 + j] = R_i[j, i]
+    return r
 
 
-@njit(cache=True)
+@compiled
 def tight_dvl_residual(
     R_i: Array,
     p_i: Array,
@@ -139,20 +164,34 @@ def tight_dvl_residual(
         r (3,) m.
     """
     d = displacement[0]
-    d_g = b_g - d.b_g
-    phi = transform(d.R_bg, d_g)
+    dp, phi, d_g, moved = np.empty(3), np.empty(3), b_g - d.b_g, np.empty((3, 3))
+    transform_into(d.R_bg, d_g, phi)
+    transform_into(d.p_bg, d_g, dp)
+    for i in range(3):
+        dp[i] += d.dp[i]
     dR = product(d.dR, exp(phi))
-    r_p = preintegrated_dvl_residual(R_i, p_i, p_j, d.dp + transform(d.p_bg, d_g), H_i, H_j)
-    missed = product(product(R_i.T, R_j), dR.T)
+    r = preintegrated_dvl_residual(R_i, p_i, p_j, dp, H_i, H_j)
+    R_ij = between(R_i, R_j)
+    missed = np.empty((3, 3))  # R_ij ΔRᵀ
+    for i in range(3):
+        for j in range(3):
+            missed[i, j] = R_ij[i, 0] * dR[j, 0] + R_ij[i, 1] * dR[j, 1] + R_ij[i, 2] * dR[j, 2]
     r_R = log(missed)
     K_J = product(K, inverse_right_jacobian(r_R))
-    H_j[:, THETA] = -product(K_J, dR)
-    H_i[:, THETA] += product(K_J, missed.T)
-    H_i[:, GYRO_BIAS] = product(product(K_J, dR), product(right_jacobian(phi), d.R_bg)) - d.p_bg
-    return r_p - transform(K, r_R)
+    K_J_dR = product(K_J, dR)
+    set_block(H_j, 0, THETA_0, -1.0, K_J_dR)
+    product_into(right_jacobian(phi), d.R_bg, moved)
+    set_product(H_i, 0, GYRO_BIAS_0, 1.0, K_J_dR, moved)
+    for i in range(3):
+        for j in range(3):
+            H_i[i, GYRO_BIAS_0 + j] -= d.p_bg[i, j]
+            r[i] -= K[i, j] * r_R[j]
+            for k in range(3):
+                H_i[i, THETA_0 + j] += K_J[i, k] * missed[j, k]
+    return r
 
 
-@njit(cache=True)
+@compiled
 def measure(
     readings: NDArray[Any], m: int, state: NDArray[Any], rig: NDArray[Any], r: Array, H: Array, C: Array
 ) -> int:
@@ -160,8 +199,7 @@ def measure(
 
     Args:
         readings: READING rows, of which the one at m is meant.
-        state, rig: STATE and RIG records of length 1. (A record taken out of an array does not keep it alive, so
-            compiled code hands on arrays.)
+        state, rig: STATE and RIG records of length 1.
         r, H, C: (3,), (3, 15), (3, 3); the first n rows are filled. C is the covariance of the reading, inflated as the
             rig says; a velocity's has the rate noise of the lever arm in it.
 
@@ -169,47 +207,35 @@ def measure(
         n, how many rows there are; 0 for a sensor that is switched off.
     """
     reading, s, g = readings[m], state[0], rig[0]
-    kind, R_WB, p_WB_W = reading.kind, s.R_WB, s.p_WB_W
+    kind, R_WB = reading.kind, s.R_WB
     width = 3
     if kind == DVL:
-        r[:] = dvl_residual(R_WB, s.v_WB_W, reading.z[0:3], H)
+        dvl_residual(R_WB, s.v_WB_W, reading.z, r, H)
     elif kind == DEPTH:
         width = 1
-        r[0] = depth_residual(R_WB, p_WB_W, g.p_BP_B, reading.z[0], H)
+        depth_residual(R_WB, s.p_WB_W, g.p_BP_B, reading.z[0], r, H)
     elif kind == GPS:
-        r[:] = gps_residual(R_WB, p_WB_W, g.p_BG_B, reading.z[0:3], H)
+        position_residual(R_WB, s.p_WB_W, g.p_BG_B, reading.z, r, H)
     elif kind == HEADING:
         width = 1
-        r[0] = yaw_residual(R_WB, g.R_BH, reading.z[0], H)
+        yaw_residual(R_WB, g.R_BH, reading.z[0], r, H)
     elif kind == ATTITUDE:
-        r[:] = attitude_residual(R_WB, g.R_BH, reading.z.reshape(3, 3), H)
+        attitude_residual(R_WB, g.R_BH, reading.z, r, H)
     else:
         width = 0
-    C[:] = 0.0
-    if kind == DVL:
-        C[:] = g.rate_cov
-    n = 0
+    n = 0  # rows that are measured; row i becomes row n
     for i in range(width):
         spread = reading.sigma[i] * g.inflate[kind]
-        if not math.isinf(spread):
-            r[n], H[n] = r[i], H[i]
-            C[n, :] = C[i, :]
-            C[:, n] = C[:, i].copy()
-            C[n, n] += spread**2
-            n += 1
+        if math.isinf(spread):
+            continue
+        r[n] = r[i]
+        for j in range(H.shape[1]):
+            H[n, j] = H[i, j]
+        row = 0
+        for j in range(i + 1):
+            if j == i or not math.isinf(reading.sigma[j] * g.inflate[kind]):
+                C[n, row] = C[row, n] = g.rate_cov[i, j] if kind == DVL else 0.0
+                row += 1
+        C[n, n] += spread * spread
+        n += 1
     return n
-
-
-@njit(cache=True)
-def decorrelate(n: int, r: Array, H: Array, C: Array) -> None:
-    """Subtract from each of the first n rows what the rows before it say of its error: C becomes diagonal (L D Lᵀ)."""
-    for k in range(n):
-        for i in range(k + 1, n):
-            if C[i, k] != 0.0:
-                share = C[i, k] / C[k, k]
-                r[i] -= share * r[k]
-                for j in range(15):
-                    H[i, j] -= share * H[k, j]
-                for j in range(k + 1, n):
-                    C[i, j] -= share * C[k, j]
-                C[i, k] = 0.0

@@ -9,59 +9,92 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from ...datasets.state import Array
+from .compiled import compiled, inner
 
 SMALL = 1e-4
 """rad; below it, two terms of each series are exact to double precision."""
 
 
-@njit(cache=True)
+# Products of matrices and vectors are loops: for three components a call of BLAS costs more than the product,
+# and loops compile faster than the same sums written out, and than expressions of arrays and slices.
+# Functions named `..._into` write to an array of the caller's, which is none of the others.
+
+
+@compiled
+def skew_into(a: Array, out: Array) -> None:
+    """Write [a]× into `out` (3, 3)."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i, i] = 0.0
+        out[k, j] = a[i]
+        out[j, k] = -a[i]
+
+
+@compiled
 def skew(a: Array) -> Array:
     """[a]×, with skew(a) @ b = a × b."""
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+    out = np.empty((3, 3))
+    skew_into(a, out)
+    return out
 
 
-@njit(cache=True)
+@compiled
+def cross_into(a: Array, b: Array, out: Array) -> None:
+    """Write a × b into `out` (3,)."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = a[j] * b[k] - a[k] * b[j]
+
+
+@compiled
 def cross(a: Array, b: Array) -> Array:
     """a × b."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    out = np.empty(3)
+    cross_into(a, b, out)
+    return out
 
 
-@njit(cache=True)
+@compiled
+def transform_into(R: Array, a: Array, out: Array) -> None:
+    """Write R a into `out` (3,)."""
+    for i in range(3):
+        out[i] = R[i, 0] * a[0] + R[i, 1] * a[1] + R[i, 2] * a[2]
+
+
+@compiled
 def transform(R: Array, a: Array) -> Array:
-    """R a, written out: for three components a call of BLAS costs more than the product."""
-    return np.array(
-        [
-            R[0, 0] * a[0] + R[0, 1] * a[1] + R[0, 2] * a[2],
-            R[1, 0] * a[0] + R[1, 1] * a[1] + R[1, 2] * a[2],
-            R[2, 0] * a[0] + R[2, 1] * a[1] + R[2, 2] * a[2],
-        ]
-    )
+    """R a."""
+    out = np.empty(3)
+    transform_into(R, a, out)
+    return out
 
 
-@njit(cache=True)
+@compiled
+def inverse_transform_into(R: Array, a: Array, out: Array) -> None:
+    """Write Rᵀ a into `out` (3,)."""
+    for i in range(3):
+        out[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
+
+
+@compiled
 def inverse_transform(R: Array, a: Array) -> Array:
-    """Rᵀ a, written out."""
-    return np.array(
-        [
-            R[0, 0] * a[0] + R[1, 0] * a[1] + R[2, 0] * a[2],
-            R[0, 1] * a[0] + R[1, 1] * a[1] + R[2, 1] * a[2],
-            R[0, 2] * a[0] + R[1, 2] * a[1] + R[2, 2] * a[2],
-        ]
-    )
+    """Rᵀ a."""
+    out = np.empty(3)
+    inverse_transform_into(R, a, out)
+    return out
 
 
-@njit(cache=True)
+@compiled
 def product_into(A: Array, B: Array, out: Array) -> None:
-    """Write A B, all (3, 3), into `out`, which is neither of them."""
+    """Write A B, all (3, 3), into `out`."""
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@njit(cache=True)
+@compiled
 def product(A: Array, B: Array) -> Array:
     """A B, both (3, 3)."""
     out = np.empty((3, 3))
@@ -69,33 +102,44 @@ def product(A: Array, B: Array) -> Array:
     return out
 
 
-@njit(cache=True)
+@compiled
+def between_into(R_i: Array, R_j: Array, out: Array) -> None:
+    """Write R_iᵀ R_j, the rotation from one attitude to another, into `out` (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = R_i[0, i] * R_j[0, j] + R_i[1, i] * R_j[1, j] + R_i[2, i] * R_j[2, j]
+
+
+@compiled
+def between(R_i: Array, R_j: Array) -> Array:
+    """R_iᵀ R_j, the rotation from one attitude to another."""
+    out = np.empty((3, 3))
+    between_into(R_i, R_j, out)
+    return out
+
+
+@inner
 def _polynomial(phi: Array, constant: float, first: float, second: float, M: Array) -> None:
     """Write constant I + first [phi]× + second [phi]×², the form of every function below, into M."""
-    x, y, z = phi[0], phi[1], phi[2]
-    M[0, 0] = constant - second * (y * y + z * z)
-    M[1, 1] = constant - second * (x * x + z * z)
-    M[2, 2] = constant - second * (x * x + y * y)
-    M[0, 1] = second * x * y - first * z
-    M[1, 0] = second * x * y + first * z
-    M[0, 2] = second * x * z + first * y
-    M[2, 0] = second * x * z - first * y
-    M[1, 2] = second * y * z - first * x
-    M[2, 1] = second * y * z + first * x
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        M[i, i] = constant - second * (phi[j] * phi[j] + phi[k] * phi[k])
+        M[i, j] = second * phi[i] * phi[j] - first * phi[k]
+        M[j, i] = second * phi[i] * phi[j] + first * phi[k]
 
 
-@njit(cache=True)
+@compiled
 def exp_into(phi: Array, out: Array) -> None:
     """Write Exp(phi) into `out` (3, 3); eq. (134)."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    if angle2 < SMALL * SMALL:
-        _polynomial(phi, 1.0, 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, out)
-    else:
+    first, second = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    if angle2 >= SMALL * SMALL:
         angle = math.sqrt(angle2)
-        _polynomial(phi, 1.0, math.sin(angle) / angle, 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2, out)
+        first, second = math.sin(angle) / angle, 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2
+    _polynomial(phi, 1.0, first, second, out)
 
 
-@njit(cache=True)
+@compiled
 def exp(phi: Array) -> Array:
     """Exp: rotation vector (3,) rad to rotation matrix (3, 3); eq. (134)."""
     out = np.empty((3, 3))
@@ -103,72 +147,93 @@ def exp(phi: Array) -> Array:
     return out
 
 
-@njit(cache=True)
-def log(R: Array) -> Array:
-    """Log: rotation matrix (3, 3) to rotation vector (3,) rad of length at most π; inverse of `exp`, eq. (135).
+@compiled
+def log_into(R: Array, out: Array) -> None:
+    """Write Log(R) into `out` (3,) rad, of length at most π; inverse of `exp`, eq. (135).
 
-    Goes through the quaternion of largest component, so that it is exact near zero and near π alike.
+    Goes through the quaternion (w, x, y, z) of largest component, so that it is exact near zero and near π alike.
     """
-    t = np.array(
-        [
-            1.0 + R[0, 0] + R[1, 1] + R[2, 2],
-            1.0 + R[0, 0] - R[1, 1] - R[2, 2],
-            1.0 - R[0, 0] + R[1, 1] - R[2, 2],
-            1.0 - R[0, 0] - R[1, 1] + R[2, 2],
-        ]
-    )  # four times the squared components w, x, y, z
-    k = np.argmax(t)
-    if k == 0:
-        q = np.array([t[0], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    elif k == 1:
-        q = np.array([R[2, 1] - R[1, 2], t[1], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]])
-    elif k == 2:
-        q = np.array([R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], t[2], R[1, 2] + R[2, 1]])
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    i, largest = -1, 1.0 + trace  # four times the square of the largest component; i: which of x, y, z, or -1 for w
+    for m in range(3):
+        square = 1.0 + 2.0 * R[m, m] - trace
+        if square > largest:
+            i, largest = m, square
+    if i < 0:
+        w = largest
+        for m in range(3):
+            j, k = (m + 1) % 3, (m + 2) % 3
+            out[m] = R[k, j] - R[j, k]
     else:
-        q = np.array([R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], t[3]])
-    q /= math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    if q[0] < 0.0:
-        q = -q
-    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, q[0]) / sine
-    return scale * q[1:]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        w = R[k, j] - R[j, k]
+        out[i], out[j], out[k] = largest, R[j, i] + R[i, j], R[k, i] + R[i, k]
+    norm = math.sqrt(w * w + out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    if w < 0.0:
+        norm = -norm
+    w /= norm
+    for m in range(3):
+        out[m] /= norm
+    sine = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    for m in range(3):
+        out[m] *= scale
 
 
-@njit(cache=True)
+@compiled
+def log(R: Array) -> Array:
+    """Log: rotation matrix (3, 3) to rotation vector (3,) rad of length at most π; inverse of `exp`, eq. (135)."""
+    out = np.empty(3)
+    log_into(R, out)
+    return out
+
+
+@compiled
+def right_jacobian_into(phi: Array, out: Array) -> None:
+    """Write `right_jacobian` into `out` (3, 3)."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    first = -0.5 + angle2 / 24.0 - angle2**2 / 720.0
+    second = 1.0 / 6.0 - angle2 / 120.0 + angle2**2 / 5040.0
+    if angle2 >= 1e-4:  # below, the closed form would lose digits by cancellation
+        angle = math.sqrt(angle2)
+        first, second = -(1.0 - math.cos(angle)) / angle2, (angle - math.sin(angle)) / (angle2 * angle)
+    _polynomial(phi, 1.0, first, second, out)
+
+
+@compiled
 def right_jacobian(phi: Array) -> Array:
     """J_r: Exp(phi + d) ≈ Exp(phi) Exp(J_r(phi) d) for small d; phi (3,) rad; eq. (143)."""
     out = np.empty((3, 3))
-    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    if angle2 < 1e-4:  # the closed form would lose digits by cancellation
-        _polynomial(
-            phi, 1.0, -0.5 + angle2 / 24.0 - angle2**2 / 720.0, 1.0 / 6.0 - angle2 / 120.0 + angle2**2 / 5040.0, out
-        )
-    else:
-        angle = math.sqrt(angle2)
-        _polynomial(phi, 1.0, -(1.0 - math.cos(angle)) / angle2, (angle - math.sin(angle)) / (angle2 * angle), out)
+    right_jacobian_into(phi, out)
     return out
 
 
-@njit(cache=True)
+@compiled
+def inverse_right_jacobian_into(phi: Array, out: Array) -> None:
+    """Write `inverse_right_jacobian` into `out` (3, 3)."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    second = 1.0 / 12.0 + angle2 / 720.0 + angle2**2 / 30240.0
+    if angle2 >= 1e-4:
+        half = 0.5 * math.sqrt(angle2)
+        second = (1.0 - half / math.tan(half)) / angle2
+    _polynomial(phi, 1.0, 0.5, second, out)
+
+
+@compiled
 def inverse_right_jacobian(phi: Array) -> Array:
     """J_r⁻¹: Log(Exp(phi) Exp(d)) ≈ phi + J_r⁻¹(phi) d for small d; |phi| < 2π; eq. (144)."""
     out = np.empty((3, 3))
-    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    if angle2 < 1e-4:
-        _polynomial(phi, 1.0, 0.5, 1.0 / 12.0 + angle2 / 720.0 + angle2**2 / 30240.0, out)
-    else:
-        half = 0.5 * math.sqrt(angle2)
-        _polynomial(phi, 1.0, 0.5, (1.0 - half / math.tan(half)) / angle2, out)
+    inverse_right_jacobian_into(phi, out)
     return out
 
 
-@njit(cache=True)
+@compiled
 def yaw_of(R: Array) -> float:
     """Yaw ψ of R = Rz(ψ) Ry(θ) Rx(φ), rad, counter-clockwise from W's first axis."""
     return math.atan2(R[1, 0], R[0, 0])
 
 
-@njit(cache=True)
+@compiled
 def wrap(angle: float) -> float:
     """The same angle in [−π, π)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -18,7 +18,6 @@ Inner loops run along rows of fixed length, so that they compile to vector instr
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.state import DIM, Array
+from ..physics.elimination import add_scaled
+from ..physics.state import symmetrise
 
 NODE = np.dtype(
     [
@@ -49,32 +50,6 @@ NODE = np.dtype(
     ]
 )
 """Nodes lie in a ring whose length is a power of two: keyframe k in slot k & (length − 1)."""
-
-
-@njit(cache=True, error_model="numpy")
-def add_scaled(out: Array, a: float, x: Array) -> None:
-    """out += a x, for fifteen components."""
-    for i in range(DIM):
-        out[i] += a * x[i]
-
-
-@njit(cache=True, error_model="numpy")
-def absorb_row(r: float, h: Array, variance: float, m: Array, P: Array) -> bool:
-    """Add the row r + h δ, of some variance, to N(m, P) of δ; False where the innovation's variance is not positive."""
-    PH = np.zeros(DIM)
-    for k in range(DIM):
-        if h[k] != 0.0:
-            add_scaled(PH, h[k], P[k])
-    S, innovation = variance, -r
-    for i in range(DIM):
-        S += h[i] * PH[i]
-        innovation -= h[i] * m[i]
-    if not S > 0.0:
-        return False
-    add_scaled(m, innovation / S, PH)
-    for i in range(DIM):
-        add_scaled(P[i], -PH[i] / S, PH)
-    return True
 
 
 @njit(cache=True, error_model="numpy")
@@ -124,50 +99,6 @@ def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j:
             if F[a, k] != 0.0:
                 add_scaled(P_j[a], F[a, k], P_ij[k])
     symmetrise(P_j)
-
-
-@njit(cache=True, error_model="numpy")
-def symmetrise(P: Array) -> None:
-    """Make P (15, 15) symmetric to the last bit."""
-    for i in range(DIM):
-        for j in range(i):
-            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
-
-
-@njit(cache=True, error_model="numpy")
-def divide_into(P: Array, A: Array, X: Array) -> bool:
-    """Fill X = P⁻¹ A, all (15, 15), by elimination of P's correlations; False where P is no covariance.
-
-    What has no variance, or none of its own, is left out of the inverse.
-    """
-    scale, L = np.empty(DIM), np.empty((DIM, DIM))
-    for i in range(DIM):
-        if not P[i, i] >= 0.0:
-            return False
-        scale[i] = 1.0 / math.sqrt(P[i, i]) if P[i, i] > 0.0 else 0.0
-    for i in range(DIM):
-        for j in range(DIM):
-            L[i, j] = P[i, j] * scale[i] * scale[j]
-            X[i, j] = A[i, j] * scale[i]
-    for k in range(DIM):
-        pivot = L[k, k]
-        if not pivot > -1e-9:
-            return False
-        inverse = 1.0 / pivot if pivot > 1e-14 else 0.0
-        for i in range(k + 1, DIM):
-            share = L[i, k] * inverse
-            add_scaled(L[i], -share, L[k])
-            add_scaled(X[i], -share, X[k])
-        for j in range(DIM):
-            X[k, j] *= inverse
-            L[k, j] *= inverse
-    for k in range(DIM - 1, -1, -1):
-        for i in range(k):
-            add_scaled(X[i], -L[i, k], X[k])
-    for i in range(DIM):
-        for j in range(DIM):
-            X[i, j] *= scale[i]
-    return True
 
 
 @njit(cache=True, error_model="numpy")

@@ -13,9 +13,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.state import DIM, POSITION, THETA, VELOCITY, Array
-from ..physics.imu import STATE, predict, process_noise
+from ..physics.imu import predict, process_noise
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
-from ..physics.so3 import exp, log, product, right_jacobian, skew
+from ..physics.so3 import exp, product, right_jacobian, skew, transform_into
+from ..physics.state import STATE, local, turn_covariance, turn_rows
 
 AT_KEYFRAME, CARRIED, LOOSE, TIGHT = range(4)
 """What a factor is: a reading that was true at its keyframe, one that the IMU carries there, and displacements."""
@@ -172,16 +173,15 @@ def linearise_tie(
     end = np.empty(1, STATE)
     predict(block, x_i, gravity, F, end)
     process_noise(block, x_i[0].R_WB, Q)
-    a, b = end[0], x_j[0]
-    e = log(product(a.R_WB.T, b.R_WB))
-    for i in range(3):
-        c[i] = -e[i]
-        c[3 + i], c[6 + i] = a.p_WB_W[i] - b.p_WB_W[i], a.v_WB_W[i] - b.v_WB_W[i]
-        c[9 + i], c[12 + i] = a.b_a[i] - b.b_a[i], a.b_g[i] - b.b_g[i]
+    b = x_j[0]
+    local(end, x_j, c)
+    e = c[THETA].copy()
+    for i in range(DIM):
+        c[i] = -c[i]
     A = np.zeros((9, 3))  # what p and v gain by the rotation of j; c is minus the residual
     A[3:6], A[6:9] = product(skew(c[POSITION]), b.R_WB), product(skew(c[VELOCITY]), b.R_WB)
     turn_rows(F, exp(-e))
-    turn_error(Q, right_jacobian(e))
+    turn_covariance(Q, right_jacobian(e))
     for i in range(3, 9):
         for k in range(3):
             c[i] += A[i, k] * c[k]
@@ -195,48 +195,13 @@ def linearise_tie(
 
 
 @njit(cache=True, error_model="numpy")
-def turn_rows(F: Array, J: Array) -> None:
-    """F ← diag(J, I) F."""
-    old = F[THETA].copy()
-    for i in range(3):
-        for j in range(DIM):
-            F[i, j] = J[i, 0] * old[0, j] + J[i, 1] * old[1, j] + J[i, 2] * old[2, j]
-
-
-@njit(cache=True, error_model="numpy")
-def turn_error(P: Array, J: Array) -> None:
-    """P ← A P Aᵀ with A = diag(J, I): the covariance (15, 15) of an error whose rotation is J times the one before."""
-    turn_rows(P, J)
-    old_columns = P[:, THETA].copy()
-    for j in range(DIM):
-        for i in range(3):
-            P[j, i] = J[i, 0] * old_columns[j, 0] + J[i, 1] * old_columns[j, 1] + J[i, 2] * old_columns[j, 2]
-
-
-@njit(cache=True, error_model="numpy")
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
     """Fill N(m, P) of the error at x that N(mean, anchor.P) of the error at the anchor makes; STATE records."""
-    a, s = anchor[0], x[0]
-    e = log(product(a.R_WB.T, s.R_WB))
-    J = right_jacobian(e)
-    for i in range(3):
-        m[3 + i] = mean[3 + i] + a.p_WB_W[i] - s.p_WB_W[i]
-        m[6 + i] = mean[6 + i] + a.v_WB_W[i] - s.v_WB_W[i]
-        m[9 + i], m[12 + i] = mean[9 + i] + a.b_a[i] - s.b_a[i], mean[12 + i] + a.b_g[i] - s.b_g[i]
-    lacking = mean[THETA] - e
-    for i in range(3):
-        m[i] = J[i, 0] * lacking[0] + J[i, 1] * lacking[1] + J[i, 2] * lacking[2]
-    P[:] = a.P
-    turn_error(P, J)
-
-
-@njit(cache=True, error_model="numpy")
-def move(x: NDArray[Any], d: Array) -> None:
-    """x ← x ⊕ d, a STATE record's P left as it is."""
-    s = x[0]
-    s.R_WB[:] = product(s.R_WB, exp(d[THETA]))
-    for i in range(3):
-        s.p_WB_W[i] += d[3 + i]
-        s.v_WB_W[i] += d[6 + i]
-        s.b_a[i] += d[9 + i]
-        s.b_g[i] += d[12 + i]
+    local(anchor, x, m)
+    J = right_jacobian(m[THETA])
+    for i in range(DIM):
+        m[i] = mean[i] - m[i]
+    lacking = m[THETA].copy()
+    transform_into(J, lacking, m[THETA])
+    P[:] = anchor[0].P
+    turn_covariance(P, J)

@@ -17,18 +17,17 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import DEPTH, DVL, HEADING
 from ...datasets.state import DIM, Array, TimeArray
-from ..filters.eskf import correct, inject, propagate
 from ..physics.dvl_preintegration import given_rotation, preintegrate_dvl
-from ..physics.imu import BLOCK, integrate, over_world, predict, process_noise, sandwich
-from ..physics.innovation import normalised_square
+from ..physics.elimination import absorb_row, divide_into, normalised_square
+from ..physics.imu import BLOCK, integrate, over_world, predict
+from ..physics.kalman import carry, correct, propagate
 from ..physics.measurements import measure
+from ..physics.state import inject, retract
 from .chain import (
     absorb_joint_row,
-    absorb_row,
     back_substitute,
     covariance_with_hindsight,
     cross_tie,
-    divide_into,
     step_back,
 )
 from .factors import (
@@ -40,7 +39,6 @@ from .factors import (
     linearise_factor,
     linearise_prior,
     linearise_tie,
-    move,
     weight_of,
 )
 
@@ -157,7 +155,7 @@ def estimate(s: Store, k: int) -> NDArray[Any]:
     """Return keyframe k as it is believed now, a STATE record; its P is of no meaning."""
     a = slot(s, k)
     x = s.points[a : a + 1].copy()
-    move(x, s.nodes[a].d)
+    retract(x, s.nodes[a].d, x)
     return x
 
 
@@ -631,7 +629,7 @@ def linearise(s: Store, exact: bool) -> int:
             if (exact or size > w.thresholds[c]) and size > CONVERGED * np.sqrt(max(node.P[c, c], 0.0)):
                 moved = True
         if moved:
-            move(s.points[a : a + 1], node.d)
+            retract(s.points[a : a + 1], node.d, s.points[a : a + 1])
             node.d[:] = 0.0
             node.moved = 1
             first = min(first, k)
@@ -693,7 +691,7 @@ def weigh(s: Store, reading: NDArray[Any], state: NDArray[Any]) -> None:
     r, H, C = np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
     n = measure(reading, 0, state, s.rig, r, H, C)
     if n:
-        d = np.sqrt(normalised_square(r[:n], C[:n, :n]))
+        d = np.sqrt(normalised_square(n, r, H, C))
         weight = weight_of(loss, d, w.width[one.kind, n])
         for i in range(3):
             one.sigma[i] = one.sigma[i] / np.sqrt(weight) if weight > 0.0 else np.inf
@@ -735,13 +733,11 @@ def leave(s: Store, until: int, swept: bool) -> None:
 def carry_on(s: Store, k: int, x: NDArray[Any], t_ns: int) -> None:
     """Carry a belief at keyframe k, a STATE record, on to t_ns."""
     w, node = s.w[0], s.nodes[slot(s, k)]
-    block, F, Q = np.empty(1, BLOCK), np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    block = np.empty(1, BLOCK)
     lo = node.imu_from - w.imu_gone
     part, _, _ = head_of(s.imu[lo : node.imu_to - w.imu_gone], t_ns)
     integrate(part, s.imu[lo - 1 : lo], x[0].b_a.copy(), x[0].b_g.copy(), s.rig, block)
-    process_noise(block, x[0].R_WB, Q)
-    predict(block, x, s.rig[0].gravity, F, x)
-    x[0].P[:] = sandwich(F, x[0].P) + Q
+    carry(block, x, s.rig[0].gravity)
 
 
 @njit(cache=True, error_model="numpy")

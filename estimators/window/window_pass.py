@@ -17,12 +17,13 @@ from ...datasets.epochs import IMU_SAMPLE, READING, SENSOR, Epoch
 from ...datasets.rig import Rig
 from ...datasets.state import Belief
 from ...datasets.trajectory import Trajectory
-from ..graph.graph_pass import LONGEST_SILENCE_S, GraphSmoother
 from ..interface import Diverged
+from ..keyframes import LONGEST_SILENCE_S
 from ..physics.dvl_preintegration import DISPLACEMENT
-from ..physics.imu import BLOCK, STATE, compile_rig, first_sample
-from ..physics.records import as_belief, as_record, with_rate_noise
+from ..physics.imu import BLOCK, compile_rig, first_sample
+from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import width
+from ..smoothers import GraphSmoother
 from .chain import NODE
 from .factors import FACTOR, LOSSES
 from .steps import (

@@ -23,11 +23,11 @@ from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, Heading
 from fathom.datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY
 from fathom.estimators import FACTORS, create
 from fathom.estimators.filters.eskf_filterpy import stack
-from fathom.estimators.physics.imu import BLOCK, STATE, compile_rig, first_sample, integrate, predict, process_noise
-from fathom.estimators.physics.records import as_record, with_rate_noise
+from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise
+from fathom.estimators.physics.state import STATE, as_record, with_rate_noise
+from linear import whitened
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
-from test_rts import whitened
 
 LAGS = (0.0, 1.0, 3.0, 10.0, math.inf)
 SECOND = 10**9

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fathom.bench.results.store import provenance
 from fathom.bench.timing.benchmarks import BENCHMARKS, write_inputs
-from fathom.bench.timing.command import machine
+from fathom.bench.timing.printing import machine
 
 
 @pytest.fixture(scope="session")

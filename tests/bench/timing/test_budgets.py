@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from fathom.bench.timing import evo
-from fathom.bench.timing.budgets import BUDGETS, Budget, Measured, array_bytes, take_turns
+from fathom.bench.timing.budget_rows import BUDGETS, array_bytes
+from fathom.bench.timing.budgets import Budget, Measured, take_turns
 from fathom.datasets import Scenario, simulate
 
 NEAR = {

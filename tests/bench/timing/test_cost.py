@@ -118,9 +118,9 @@ def test_the_readme_shows_the_table_that_the_command_makes() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--profile", "eskff"], "no estimator 'eskff'"),
-        (["--profile", "eskf", "-o", "{file}"], "cannot be made"),
-        (["--cost", "-o", "{file}"], "cannot be made"),
+        (["profile", "eskff"], "no estimator 'eskff'"),
+        (["profile", "eskf", "-o", "{file}"], "cannot be made"),
+        (["cost", "-o", "{file}"], "cannot be made"),
     ],
 )
 def test_what_cannot_be_profiled_or_written_is_refused_in_one_line(

@@ -1,19 +1,22 @@
+"""Every estimator's time is split the same way, the parts add up, and timing changes nothing."""
+
 from __future__ import annotations
 
 import subprocess
 import sys
-from importlib import import_module
-from time import perf_counter_ns
+import time
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import pytest
-from fathom.bench.timing.driver import PARTS, Driver, Timed, quickest
-from fathom.bench.timing.probes import PROBES
+from fathom.bench.timing.passes import PARTS, Timed, WatchedPass, quickest, stopwatch, timed_run
 from fathom.bench.timing.profile import Profile, draw_profile, profile, profile_table
 from fathom.bench.timing.scaling import Steps, by_lag, course, over_log
 from fathom.datasets import Log, Scenario, simulate
 from fathom.estimators import ESTIMATORS, create
 from fathom.estimators.registry import EstimatorError
+from fathom.estimators.stages import clock, stage
 from rich.console import Console
 
 
@@ -22,61 +25,96 @@ def log() -> Log:
     return simulate(Scenario(mission="lawnmower", duration_s=40.0, imu="tactical"), seed=1)
 
 
-def test_every_probe_names_what_is_there() -> None:
-    names = [name for of_part in PROBES.values() for name in of_part]
-    assert len(names) == len(set(names))
-    for name in names:
-        module, *attributes = name.split(".")
-        owner = import_module(f"fathom.estimators.{module}")
-        for attribute in attributes:
-            owner = vars(owner)[attribute]
+@stage("linearisation")
+def residual() -> None:
+    time.sleep(0.003)
 
 
-def test_every_nanosecond_belongs_to_one_part_and_of_two_to_the_greater() -> None:
-    from fathom.bench.timing.stopwatch import BOARD, ENTER, LEAVE, Part, enter, leave, totals
-    from numba import njit
+@stage("solve")
+def solve() -> None:
+    time.sleep(0.005)
+    residual()
 
-    assert tuple(part.name.lower() for part in Part) == PARTS
-    assert set(PROBES) < set(Part.__members__)
 
-    @njit
-    def work(inside: int) -> float:
-        total = 0.0
-        ENTER(inside)
-        for k in range(300_000):
-            total += np.sqrt(k)
-        LEAVE()
-        return total
+class Sleeping:
+    """A pass that solves in every step, and rests as well."""
 
-    enter(int(Part.IDLE))
-    work(int(Part.IDLE))
-    leave()  # compiled
-    begun, started = totals(), perf_counter_ns()
-    enter(int(Part.REST))
-    work(int(Part.SOLVE))
-    solved = totals()
-    enter(int(Part.OUTPUT))
-    work(int(Part.SOLVE))  # is done for the output
-    work(int(Part.MARGINAL))
-    leave()
-    leave()
-    elapsed_ns = perf_counter_ns() - started
-    spent = dict(zip(PARTS, (totals() - begun).tolist(), strict=True))
-    assert BOARD[0] == 0
-    assert spent["solve"] == (solved - begun)[Part.SOLVE] > 0
-    assert min(spent["output"], spent["marginal"]) > 0
-    assert spent["propagation"] == spent["linearisation"] == 0
-    inside_ns = sum(ns for part, ns in spent.items() if part != "idle")
-    assert 0.9 * elapsed_ns < inside_ns <= elapsed_ns
+    counts: ClassVar[dict[str, int]] = {}
+
+    def step(self, epoch: object) -> None:
+        time.sleep(0.002)
+        solve()
+
+    def belief(self) -> str:
+        time.sleep(0.004)
+        return "belief"
+
+    def finish(self) -> None:
+        return None
+
+
+def test_every_nanosecond_of_a_step_belongs_to_one_part_and_what_is_marked_inside_another_to_itself() -> None:
+    steps, beliefs = [], []
+    one = WatchedPass(Sleeping(), steps, beliefs)  # type: ignore[arg-type]
+    clock.start()
+    try:
+        started = time.perf_counter_ns()
+        one.step(None)  # type: ignore[arg-type]
+        elapsed_ns = time.perf_counter_ns() - started
+        assert one.belief() == "belief"
+    finally:
+        clock.stop()
+    step, belief = (dict(zip(PARTS, parts.tolist(), strict=True)) for parts in (steps[0], beliefs[0]))
+    assert 0.9 * elapsed_ns < sum(step.values()) <= elapsed_ns
+    assert step["linearisation"] >= 3e6
+    assert step["solve"] >= 5e6
+    assert step["rest"] >= 2e6
+    assert step["propagation"] == step["marginal"] == step["output"] == 0
+    assert belief["output"] == sum(belief.values()) >= 4e6
+
+
+def test_a_pass_of_another_package_that_marks_nothing_is_all_rest(log: Log) -> None:
+    @dataclass(frozen=True)
+    class Theirs:
+        factors: frozenset[str] = frozenset()
+
+        def begin(self, prior: object, rig: object) -> Still:
+            return Still(prior)
+
+    timed = timed_run(log, Theirs(), stages=True)  # type: ignore[arg-type]
+    assert isinstance(timed, Timed)
+    assert timed.step_parts[:, :-1].sum() == 0
+    assert timed.step_parts.shape == (len(timed.step_ns), len(PARTS))
+    assert not clock.running
+
+
+class Still:
+    """Says that the vehicle stays where it is."""
+
+    counts: ClassVar[dict[str, int]] = {}
+
+    def __init__(self, prior: object) -> None:
+        self.said = prior
+
+    def step(self, epoch: object) -> None:
+        self.t_ns = epoch.t_ns  # type: ignore[attr-defined]
+
+    def belief(self) -> object:
+        from dataclasses import replace
+
+        return replace(self.said, t_ns=self.t_ns)  # type: ignore[type-var]
+
+    def finish(self) -> None:
+        return None
 
 
 def timed(step_ns: list[int], first_part: list[int]) -> Timed:
-    """A run of two parts, the second being what is left of each step."""
+    """A run of two parts, the second being the remainder of each step."""
     parts = np.zeros((len(step_ns), len(PARTS)), np.int64)
     parts[:, 1], parts[:, 2] = first_part, np.subtract(step_ns, first_part)
     nothing = np.zeros((0, len(PARTS)), np.int64)
     t_ns, none = np.arange(len(step_ns)), np.zeros(0, np.int64)
-    return Timed(t_ns, np.array(step_ns), none, sum(step_ns), 1, 1.0, {}, parts, nothing, parts[0], None)
+    return Timed(t_ns, np.array(step_ns), none, sum(step_ns), 1, {}, parts, nothing, None)
 
 
 def test_of_each_step_the_quickest_is_taken_with_its_own_parts() -> None:
@@ -91,17 +129,17 @@ def test_a_run_in_a_process_of_its_own_says_what_it_says_here_and_which_steps_it
     from fathom.bench import run_log
 
     here = run_log(log, create("eskf"))
-    with Driver(probed=False) as driver:
-        assert driver.warm_up(create("eskf")) > 0
-        there = driver.run(log, create("eskf"))
+    with stopwatch() as process:
+        process.warm_up(create("eskf"))
+        there = process.run(log, create("eskf"))
         assert len(there.step_ns) == len(there.t_ns) == len(here.step_ns)
         assert there.step_parts.shape == (len(here.step_ns), len(PARTS))
         assert there.online is not None
         assert here.online is not None
         np.testing.assert_array_equal(there.online.p_WB_W, here.online.p_WB_W)
         with pytest.raises(EstimatorError, match="diverged"):
-            driver.run(log, create("fls", factorization="CHOLESKY"))
-        driver.run(log, create("eskf"))  # is none the worse
+            process.run(log, create("fls", factorization="CHOLESKY"))
+        process.run(log, create("eskf"))  # is none the worse
 
 
 def test_growth_is_told_from_flatness() -> None:
@@ -149,13 +187,13 @@ def test_the_parts_of_every_estimator_add_up_to_its_steps_and_beliefs(profiles: 
 
 
 @pytest.mark.slow
-def test_probes_change_nothing_that_is_said(profiles: list[Profile], log: Log) -> None:
-    with Driver(probed=False) as plain:
+def test_timing_the_stages_changes_nothing_that_is_said(profiles: list[Profile], log: Log) -> None:
+    with stopwatch() as process:
         for one in profiles:
-            online = plain.run(log, create(one.label)).online
+            online = process.run(log, create(one.label)).online
             assert online is not None
             assert one.timed.online is not None
-            np.testing.assert_allclose(one.timed.online.p_WB_W, online.p_WB_W, atol=1e-9, rtol=0)
+            np.testing.assert_array_equal(one.timed.online.p_WB_W, online.p_WB_W)
 
 
 @pytest.mark.slow

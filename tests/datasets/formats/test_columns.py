@@ -18,8 +18,9 @@ from fathom.datasets.described.opening import CATALOG, open_log
 from fathom.datasets.formats import columns as module
 from fathom.datasets.formats.columns import Table, read_table
 from fathom.datasets.times import times_ns
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from written import FUZZ
 
 START = 1_700_000_000
 PIECES = pytest.mark.parametrize(("rows", "size"), [(1, 1), (2, 7), (3, 100), (1000, 1 << 18)])
@@ -153,7 +154,7 @@ def test_a_parquet_file_may_be_empty_or_name_a_column_twice(tmp_path):
     read = read_table(tmp_path, Table(file="a.parquet"), ["x"], ["t"])
     assert {name: len(values) for name, values in read.items()} == {"x": 0, "t": 0}
     pq.write_table(pa.Table.from_arrays([pa.array([1]), pa.array([2])], ["x", "x"]), tmp_path / "a.parquet")
-    with pytest.raises(DatasetError, match="2 columns are called 'x'"):
+    with pytest.raises(DatasetError, match="2 columns are named 'x'"):
         read_table(tmp_path, Table(file="a.parquet"), ["x"])
 
 
@@ -161,8 +162,8 @@ MEASURE = """
 import resource, sys
 from pathlib import Path
 import numpy as np, pandas as pd
-from fathom.datasets.formats.columns import read_table, times_ns
-from fathom.datasets.described.description import Table
+from fathom.datasets.formats.columns import Table, read_table
+from fathom.datasets.times import times_ns
 folder, name = Path(sys.argv[1]), sys.argv[2]
 form = Table(file=name)
 small = read_table(folder, Table(file="small" + Path(name).suffix), ["c1", "c2"], ["t"])  # what the libraries take
@@ -174,6 +175,7 @@ print((after - before) * (1 if sys.platform == "darwin" else 1024), len(t_ns), i
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_memory_is_that_of_the_wanted_columns(tmp_path, suffix):
     """A table of 110 MB and 20 columns, of which 3 are wanted: 300,000 rows, 7 MB."""
@@ -260,7 +262,7 @@ def test_an_array_of_numbers_may_be_empty(arrays):
         (np.zeros(5, complex), r"v.npy: expected numbers in rows and columns, found"),
         (np.zeros(5, [("x", float)]), r"v.npy: expected numbers in rows and columns, found"),
         (np.array([{}] * 5, object), r"v.npy: cannot be read as an array"),
-        (np.zeros((4, 3)), r"arrays that stand side by side must be of one length, found \{'t': 5, 'v.0': 4"),
+        (np.zeros((4, 3)), r"the arrays must be of equal length, found \{'t': 5, 'v.0': 4"),
         (np.zeros((5, 2)), r"no column 'v.2'; did you mean 'v.[01]'\?; found t, v.0, v.1"),
         (np.zeros(5), r"no column 'v.0'; found t, v$"),
         (b"not an array", r"v.npy: cannot be read as an array"),
@@ -375,9 +377,6 @@ def test_comma2k19s_reference_is_consistent_in_its_own_frame(comma):
 
 # -- damage
 
-FUZZ = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
 JUNK = st.one_of(st.binary(max_size=8), st.text('0123456789,;.-e\n\r\t infa"%#', max_size=12).map(str.encode))
 TEXT = b"% remark\nt ,x,y\n" + b"".join(b"%d.%03d, %d.5,-1e3,\r\n" % (START + i, i, i) for i in range(12))
 

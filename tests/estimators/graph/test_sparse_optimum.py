@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse
-from fathom.bench.execution.drive import run_log, score_ticks
+from driver import run_log, ticks
 from fathom.datasets import Belief, Log, NavState, Trajectory
 from fathom.datasets.epochs import Epoch, cut
 from fathom.datasets.simulated.scenario import Scenario
@@ -16,7 +16,7 @@ from fathom.estimators import create
 from fathom.estimators.filters.eskf_filterpy import stack
 from fathom.estimators.interface import FACTORS
 from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise
-from fathom.estimators.physics.records import as_belief, as_record
+from fathom.estimators.physics.state import as_belief, as_record
 
 SMALL = {"depth_m": 5.0, "shallow_m": 1.0, "leg_m": 15.0, "turn_radius_m": 5.0, "surface_for_s": 20.0}
 """A minute of it holds two stays at the surface, and legs and turns, or dives and climbs, between them."""
@@ -30,7 +30,7 @@ class WholeLog:
 
     def __init__(self, log: Log) -> None:
         self.prior, self.gravity = log.prior, log.rig.gravity
-        self.epochs: list[Epoch] = cut(log, score_ticks(log, 1.0)).epochs
+        self.epochs: list[Epoch] = cut(log, ticks(log, 1.0)).epochs
         assert all((epoch.readings["t_ns"] == epoch.t_ns).all() for epoch in self.epochs)
         self.rig = compile_rig(log.rig, FACTORS, {})
         first = first_sample(self.epochs[0].imu, self.rig)

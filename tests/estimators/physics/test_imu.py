@@ -11,19 +11,19 @@ from fathom.datasets.epochs import IMU_SAMPLE, cut
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.estimators import FACTORS
-from fathom.estimators.filters.eskf import propagate
 from fathom.estimators.graph.gtsam_border import preintegrate_imu
 from fathom.estimators.physics.imu import (
     BLOCK,
-    STATE,
     compile_rig,
     first_sample,
     integrate,
     predict,
     process_noise,
     sandwich,
+    split,
 )
-from fathom.estimators.physics.records import as_belief, as_record, split, with_rate_noise
+from fathom.estimators.physics.kalman import propagate
+from fathom.estimators.physics.state import STATE, as_belief, as_record, with_rate_noise
 from paths import GRAVITY, NOISE, Path, random_rig
 
 ZERO_P = np.zeros((15, 15))
@@ -214,7 +214,9 @@ def test_process_noise_is_symmetric_and_sandwich_is_f_p_f_transposed() -> None:
     predict(block, as_record(Belief(0, state, ZERO_P)), GRAVITY, F, np.zeros(1, STATE))
     process_noise(block, state.R_WB, Q)
     A = rng.normal(size=(15, 15))
-    assert np.allclose(sandwich(F, A @ A.T), F @ A @ A.T @ F.T, rtol=1e-12)
+    out = np.empty((15, 15))
+    sandwich(F, A @ A.T, np.eye(15), out)
+    assert np.allclose(out, F @ A @ A.T @ F.T + np.eye(15), rtol=1e-12)
     assert np.allclose(Q, Q.T, atol=1e-15 * np.abs(Q).max(), rtol=1e-12)
     assert np.linalg.eigvalsh(Q).min() > -1e-18
 

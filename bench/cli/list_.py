@@ -1,0 +1,64 @@
+"""`fathom list`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import typer
+
+
+class Listing(StrEnum):
+    """What `fathom list` can list."""
+
+    estimators = "estimators"
+    logs = "logs"
+    experiments = "experiments"
+    scores = "scores"
+
+
+def list_(what: Listing) -> None:
+    """List estimators with their options, logs, experiments, or scores."""
+    for name, about in LISTS[what]().items():
+        typer.echo(f"{name}: {about}" if about else name)
+
+
+def _estimators() -> dict[str, str]:
+    from ...estimators.registry import EstimatorError, known_estimators, load_estimator
+
+    found = {}
+    for name in known_estimators():
+        try:
+            found[name] = ", ".join(getattr(load_estimator(name), "__dataclass_fields__", ()))
+        except EstimatorError as error:
+            found[name] = str(error).removeprefix(f"{name}: ")
+    return found
+
+
+def _logs() -> dict[str, str]:
+    from ...datasets.described.opening import catalog_names
+    from ...datasets.simulated.specs import MISSIONS
+
+    return dict.fromkeys(catalog_names(), "recorded") | dict.fromkeys(MISSIONS, "mission, simulated")
+
+
+def _experiments() -> dict[str, str]:
+    import yaml
+
+    from ..experiment.packaged import shipped_experiments
+
+    return {name: yaml.safe_load(path.read_text())["description"] for name, path in shipped_experiments().items()}
+
+
+def _scores() -> dict[str, str]:
+    from ..metrics.floor_ratio import FLOORS
+    from ..metrics.scoring import COSTS, INNOVATIONS, SCORES
+
+    return SCORES | FLOORS | INNOVATIONS | COSTS
+
+
+LISTS = {
+    Listing.estimators: _estimators,
+    Listing.logs: _logs,
+    Listing.experiments: _experiments,
+    Listing.scores: _scores,
+}

@@ -1,0 +1,16 @@
+"""Arguments and options that several verbs share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ExperimentName = Annotated[
+    str, typer.Argument(metavar="EXPERIMENT", help="Name of a shipped experiment, or YAML file.")
+]
+Data = Annotated[Path | None, typer.Option(envvar="FATHOM_DATA", help="Folder with the recorded logs.")]
+Results = Annotated[Path, typer.Option("--out", help="Folder for results.")]
+Jobs = Annotated[int, typer.Option(min=0, help="Number of worker processes; 0: one per core.")]
+Repair = Annotated[bool, typer.Option("--repair", help="Drop bad rows of a log and report how many.")]

@@ -1,0 +1,61 @@
+"""`fathom run`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .options import Data, ExperimentName, Jobs, Repair, Results
+from .verb import BAD_INPUT, SOME_FAILED, on_interrupt
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def run(
+    experiment: ExperimentName,
+    data: Data = None,
+    out: Results = Path("results"),
+    jobs: Jobs = 0,
+    only: Annotated[
+        str | None,
+        typer.Option(metavar="GLOB", help='Run only what matches: a label, a log\'s name, or "log/label".'),
+    ] = None,
+    repair: Repair = False,
+    force: Annotated[bool, typer.Option("--force", help="Repeat runs that are already finished.")] = False,
+    dask: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help='Run on a Dask cluster: tcp://host:port, its scheduler file (.json), or "local" (starts a cluster of '
+            "--jobs processes here).",
+        ),
+    ] = None,
+) -> None:
+    """Run an experiment and print its tables.
+
+    Every estimator of EXPERIMENT runs on each of its logs. Finished runs are kept. They are repeated only if their
+    spec, their log or a version has changed.
+    """
+    from ..execution.sweep import sweep
+    from ..experiment.plan import Experiment
+    from ..output.present import present, print_log
+
+    plan = Experiment.load(experiment)
+    folder = out / plan.name
+    printed: set[str] = set()
+
+    def print_finished(rows: pd.DataFrame) -> None:
+        print_log(rows, plan)
+        printed.update(rows["log"])
+
+    with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
+        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, print_finished)
+    present(outcome, plan, folder, printed)
+    statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
+    if statuses <= {"absent"}:  # nothing was run
+        raise typer.Exit(BAD_INPUT)
+    if statuses - {"done", "absent"}:
+        raise typer.Exit(SOME_FAILED)

@@ -1,0 +1,43 @@
+"""`fathom simulate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from ...datasets.simulated.scenario import Scenario
+
+
+def simulate(
+    scenario: Annotated[str, typer.Argument(help="YAML file with the keys of a scenario, or the name of a mission.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write; it must not hold a log already.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+) -> None:
+    """Simulate a mission and write it as a log.
+
+    The log is a folder of Parquet files with a log.yaml.
+    """
+    from ...datasets.described.folder import write_folder
+    from ...datasets.simulated import simulator
+
+    log = simulator.simulate(_scenario(scenario), seed)
+    write_folder(log, out)
+    typer.echo(f"{out}: {log.name}, {log.duration_s:.0f} s, {', '.join(['imu', *log.streams, 'truth'])}")
+
+
+def _scenario(text: str) -> Scenario:
+    import yaml
+
+    from ...datasets.errors import DatasetError
+    from ...datasets.simulated.scenario import Scenario
+
+    if not text.endswith((".yaml", ".yml")):
+        return Scenario.from_dict({"mission": text})
+    try:
+        content = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise DatasetError(f"{text}: not readable as YAML: {' '.join(str(error).split())}") from None
+    return Scenario.from_dict(content, text)

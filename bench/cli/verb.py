@@ -1,0 +1,54 @@
+"""How every verb ends: bad input is one line on standard error and status 2; Ctrl-C is status 130."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit statuses; 130 is what shells report for a command that Ctrl-C ended (128 + SIGINT)."""
+
+
+class Verb(TyperCommand):
+    """A command that reports what a user can correct in one line. Bugs of ours keep their traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        try:
+            with on_interrupt("interrupted"):
+                return super().invoke(ctx)
+        except ValueError as error:
+            from ...datasets.errors import DatasetError
+            from ...estimators.registry import EstimatorError
+            from ..errors import ExperimentError
+            from ..metrics.association import ScoreError
+
+            if not isinstance(error, DatasetError | EstimatorError | ExperimentError | ScoreError):
+                raise
+            refuse(" ".join(str(error).split()))
+
+
+@contextmanager
+def on_interrupt(message: str) -> Iterator[None]:
+    """On Ctrl-C, print what is kept and exit with status 130."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        say(message)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def refuse(message: str) -> None:
+    """Print why nothing was run, and exit with status 2."""
+    say(f"fathom: {message}")
+    raise typer.Exit(BAD_INPUT) from None
+
+
+def say(message: str) -> None:
+    """Print on standard error."""
+    print(message, file=sys.stderr)

@@ -1,0 +1,128 @@
+"""What a run costs beyond its work, and what finished runs cost when the same command is given again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from ...datasets import Scenario, simulate
+from ...estimators import create
+from ..execution.child import THREAD_COUNTS, start
+from ..execution.drive import run_log
+from ..execution.task import Task
+from ..execution.worker import WorkerCache
+from ..experiment.plan import Experiment
+from ..results.store import Store
+from .budgets import Measured
+
+FINISHED = 20_000
+WORK_S = 0.4
+"""Processor time of simulating and running in each round: enough for the clock, and for what happens now and then."""
+ROUNDS = 5
+
+
+def _experiment(duration_s: float, seeds: int, estimator: str = "eskf") -> dict[str, Any]:
+    return {
+        "name": "runs",
+        "description": "Many runs.",
+        "logs": [{"scenario": {"duration_s": duration_s}}],
+        "estimators": [{"name": estimator}],
+        "seeds": seeds,
+    }
+
+
+def whole_run(duration_s: float) -> Measured:
+    """Measure the processor time of whole runs of `eskf` in a worker over that of simulating and running alone."""
+    with start(f"{__name__}:serve", str(duration_s)) as child:
+        ratios, whole_ms, alone_ms = child.connection.recv()
+    return Measured(ratios, f"{whole_ms:.0f} ms a run, {alone_ms:.0f} ms of them simulating and running")
+
+
+def serve(connection: Any, duration: str) -> None:
+    """In a process like a worker's: let whole runs and their work alone take turns, and send what they took."""
+    duration_s = float(duration)
+    experiment = Experiment.from_dict(_experiment(duration_s, 1000))
+    tasks = iter([Task.of(experiment, run) for run in experiment.runs()])
+    scenario, estimator, bench = Scenario(duration_s=duration_s), create("eskf"), WorkerCache()
+
+    def whole(task: Task) -> None:
+        (row,) = bench.execute(task).rows
+        assert row["status"] == "done", row["cause"]
+
+    def alone(task: Task) -> None:
+        assert task.run.seed is not None
+        run_log(simulate(scenario, task.run.seed), estimator)
+
+    def seconds(work: Any, some: list[Task]) -> float:
+        started = time.process_time()
+        for task in some:
+            work(task)
+        return (time.process_time() - started) / len(some)
+
+    warm = [next(tasks) for _ in range(3)]
+    seconds(whole, warm)
+    n = max(2, round(WORK_S / seconds(alone, warm)))
+    rounds = []
+    for _ in range(ROUNDS):
+        some = [next(tasks) for _ in range(n)]
+        rounds.append((seconds(whole, some), seconds(alone, some)))
+    whole_s, alone_s = (1e3 * sum(column) / ROUNDS for column in zip(*rounds, strict=True))
+    connection.send((tuple(a / b for a, b in rounds), whole_s, alone_s))
+
+
+def finished_again_s() -> Measured:
+    """Measure the processor time of `fathom run` on an experiment whose runs are all finished, s."""
+    cpu_s, wall_s, _ = _again(FINISHED)
+    return Measured((cpu_s,), f"processor time; {wall_s:.0f} s by the clock")
+
+
+def finished_again_mb() -> Measured:
+    """Measure the peak memory of the same command, MB."""
+    return Measured((_again(FINISHED)[2],))
+
+
+@cache
+def _again(n: int) -> tuple[float, float, float]:
+    """Return processor time, time (s) and peak memory (MB) of the command on n finished runs.
+
+    One run is made. Its row and its trajectories stand for all others, under their own seeds and identities.
+    """
+    plan = _experiment(20.0, n, "dead-reckoning")
+    experiment = Experiment.from_dict(plan)
+    tasks = [Task.of(experiment, run) for run in experiment.runs()]
+    with TemporaryDirectory() as temporary:
+        file, folder = Path(temporary) / "runs.yaml", Path(temporary) / "runs"
+        file.write_text(repr(plan), encoding="utf-8")
+        one = WorkerCache().execute(tasks[0])
+        (row,) = one.keep(folder)
+        with Store(folder / "runs.sqlite") as store:
+            store.write(
+                [{**row, "seed": task.run.seed, "identity": task.identity, "spec": _spec(task)} for task in tasks]
+            )
+        command = [sys.executable, "-m", "fathom.bench.cli.app", "run", str(file), "--out", temporary]
+        started = time.perf_counter()
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | dict.fromkeys(THREAD_COUNTS, "1"),
+        )
+        assert process.stderr is not None
+        said = process.stderr.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        assert os.waitstatus_to_exitcode(status) == 0, said
+        assert f"{n} runs were done already" in said or f"{n} " in said, said
+        wall_s = time.perf_counter() - started
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux kilobytes
+    return usage.ru_utime + usage.ru_stime, wall_s, usage.ru_maxrss * unit / 1e6
+
+
+def _spec(task: Task) -> str:
+    return str(task.row("done", None)["spec"])

@@ -1,0 +1,38 @@
+"""Blocks of 3 × 3 in a larger matrix, written by loops, which compile ten times as fast as slices."""
+
+from __future__ import annotations
+
+from ...datasets.state import Array
+from .compiled import compiled
+
+
+@compiled
+def clear(M: Array) -> None:
+    """M ← 0."""
+    for i in range(M.shape[0]):
+        for j in range(M.shape[1]):
+            M[i, j] = 0.0
+
+
+@compiled
+def identity(M: Array) -> None:
+    """M ← I, square."""
+    clear(M)
+    for i in range(M.shape[0]):
+        M[i, i] = 1.0
+
+
+@compiled
+def set_block(M: Array, row: int, column: int, scale: float, A: Array) -> None:
+    """Write scale A (3, 3) into M, from (row, column) on."""
+    for i in range(3):
+        for j in range(3):
+            M[row + i, column + j] = scale * A[i, j]
+
+
+@compiled
+def set_product(M: Array, row: int, column: int, scale: float, A: Array, B: Array) -> None:
+    """Write scale A B, both (3, 3), into M, from (row, column) on."""
+    for i in range(3):
+        for j in range(3):
+            M[row + i, column + j] = scale * (A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j])

@@ -1,0 +1,53 @@
+"""The two steps of the error-state Kalman filter, compiled: for the filters, and for smoothers between keyframes.
+
+Source: Solà 2017, arXiv:1711.02298, sections 5–6, with the error on the right of R_WB and the block of `imu` as the
+transition.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.state import DIM
+from .compiled import compiled
+from .elimination import absorb
+from .imu import integrate, predict, process_noise, sandwich
+from .measurements import measure
+from .state import inject
+
+
+@compiled
+def propagate(
+    state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
+) -> None:
+    """x ← f(x, imu), P ← F P Fᵀ + Q; fills `block` with the motion."""
+    integrate(imu, before, state[0].b_a, state[0].b_g, rig, block)
+    carry(block, state, rig[0].gravity)
+
+
+@compiled
+def carry(block: NDArray[Any], state: NDArray[Any], gravity: float) -> None:
+    """Carry a STATE record, with its P, over a BLOCK, in place."""
+    F, Q = np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    process_noise(block, state[0].R_WB, Q)
+    predict(block, state, gravity, F, state)
+    sandwich(F, state[0].P, Q, state[0].P)
+
+
+@compiled
+def correct(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
+    """Correct by all readings, linearised together at the predicted state; False where that is impossible."""
+    dx, r, H, C = np.zeros(DIM), np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
+    for m in range(len(readings)):
+        n = measure(readings, m, state, rig, r, H, C)
+        if not absorb(n, r, H, C, dx, state[0].P):
+            return False
+    inject(state, dx)
+    total = 0.0
+    for i in range(DIM):
+        total += dx[i]
+    return math.isfinite(total)
