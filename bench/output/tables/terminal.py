@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 WIDTH = 120
+"""Columns where there is no terminal: the widest table of the packaged experiments fits."""
 
 
 def console() -> Console:
