@@ -43,6 +43,7 @@ from .factors import (
 )
 
 DONE, NOT_POSITIVE, NOT_FINITE, NOT_CONVERGED = range(4)
+"""What a call returns."""
 CAUSES = {
     NOT_POSITIVE: "an innovation's or a predicted state's covariance is not positive",
     NOT_FINITE: "the newest position is not finite",
@@ -51,6 +52,7 @@ CAUSES = {
 CONVERGED = 1e-6
 """Of a sigma: what moves by less has not moved."""
 MOST_ITERATIONS = 100
+"""Of Gauss–Newton over the whole log; a run that has not converged by then is recorded as diverged."""
 
 WINDOW = np.dtype(
     [

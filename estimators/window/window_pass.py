@@ -45,6 +45,7 @@ from .steps import (
 )
 
 NEVER_NS = 1 << 62
+"""Later than any valid time (LIMIT_NS)."""
 NO_IMU, NO_READINGS = np.zeros(0, IMU_SAMPLE), np.zeros(0, READING)
 
 
