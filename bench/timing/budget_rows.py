@@ -31,6 +31,7 @@ from .budgets import Budget, Measured, take_turns
 from .whole_runs import finished_again_mb, finished_again_s, whole_run
 
 LAGS_S = (3.0, 10.0, 30.0)
+"""The lags of the main experiment, and a long one."""
 CHEAPER = ({}, {"wildfire": 0.1}, {"wildfire": 0.1, "relinearize": [0.05, 1e3, 0.5, 10.0]})
 """Settings of `fls`, each cheaper than the one before."""
 

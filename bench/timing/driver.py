@@ -25,6 +25,7 @@ from ...estimators.registry import EstimatorError
 PARTS = ("idle", "rest", "solve", "propagation", "linearisation", "output", "marginal")
 """The names of `stopwatch.Part`, known without numba."""
 STEP, BELIEF, FINISH = range(3)
+"""The calls of a pass that are timed, as rows of the records."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")
 
 
