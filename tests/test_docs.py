@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -112,3 +113,11 @@ def test_the_index_lists_every_page() -> None:
     assert {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"} <= set(
         re.findall(r"\((.+?\.md)\)", index)
     )
+
+
+@pytest.mark.parametrize("package", ["bench/fathom", "bench", "datasets", "estimators"])
+def test_each_package_says_in_some_ten_lines_what_lives_there(package: str) -> None:
+    said = ast.get_docstring(ast.parse((ROOT / package / "__init__.py").read_text(encoding="utf-8"))) or ""
+    assert 8 <= len(said.splitlines()) <= 16
+    folders = {path.parent.name for path in (ROOT / package).glob("*/__init__.py")}
+    assert not [folder for folder in folders if f"`{folder}`" not in said]
