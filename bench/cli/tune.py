@@ -43,9 +43,7 @@ def tune(
         str,
         typer.Option(help="Score from `fathom list scores`: errors are minimised, NEES and NIS brought to their due."),
     ] = "ate_rmse_m",
-    output: Annotated[
-        Output, typer.Option(help="Score the online or the smoothed trajectory.")
-    ] = Output.online,
+    output: Annotated[Output, typer.Option(help="Score the online or the smoothed trajectory.")] = Output.online,
     span: Annotated[float, typer.Option(min=1.01, help="Factors are searched from 1/SPAN to SPAN.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
     data: Data = None,

@@ -275,7 +275,7 @@ def test_the_command_runs_on_a_cluster_of_its_own(tmp_path: Path, site: Path) ->
         ("tcp://127.0.0.1:9", [], "no Dask scheduler answers within 1 s"),
         ("nowhere", [], "no Dask scheduler answers"),
         ("gone.json", [], "gone.json: not a scheduler file (FileNotFoundError"),
-        ("tcp://127.0.0.1:9", ["--jobs", "3"], "--jobs 3: how many workers there are is the affair of the cluster"),
+        ("tcp://127.0.0.1:9", ["--jobs", "3"], "--jobs 3: only for --dask local; the cluster at"),
     ],
 )
 def test_an_address_where_no_scheduler_is_gets_one_line_and_status_2(

@@ -432,16 +432,13 @@ def test_what_a_store_lacks_is_said_and_the_rest_is_shown(
         assert said in text
 
 
-def test_the_store_of_an_older_version_gives_a_page(tmp_path: Path) -> None:
+def test_the_store_of_another_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
     with closing(sqlite3.connect(tmp_path / "runs.sqlite")) as store, store:
         store.execute("CREATE TABLE runs (experiment, log, label, seed, output, status, cause, ate_rmse_m, n_scored)")
-        store.execute("INSERT INTO runs VALUES ('old', 'dive', 'eskf', 1, 'online', 'done', NULL, 1.25, 10)")
-    code, out, _ = call("report", tmp_path, "-o", tmp_path / "new" / "page.html")
-    assert code == 0
-    assert out.startswith(str(tmp_path / "new" / "page.html"))
-    text = (tmp_path / "new" / "page.html").read_text(encoding="utf-8")
-    assert 'data-value="1.25">1.25<' in text
-    assert not (tmp_path / "report.html").exists()
+    code, out, err = call("report", tmp_path, "-o", tmp_path / "new" / "page.html")
+    assert (code, out) == (2, "")
+    assert "another version wrote it" in err
+    assert "move it away" in err
 
 
 def test_report_finds_a_result_by_name_and_writes_what_run_wrote(
