@@ -45,6 +45,7 @@ from ..physics.imu import integrate, predict, process_noise, sandwich, turns
 from ..physics.measurements import measure
 from ..physics.so3 import cross_into, exp, product, right_jacobian, skew_into, transform, transform_into
 from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
+from ..stages import stage
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 PHI, RHO, NU = THETA, POSITION, VELOCITY
@@ -80,6 +81,7 @@ class InvariantKalman(Kalman):
         """See `Kalman.correct`."""
         return correct_invariant(state, rig, readings, self._origin)
 
+    @stage("marginal")
     def error_covariance(self, state: NDArray[Any]) -> Array:
         """See `Kalman.error_covariance`. (The rate noise that a belief adds to v is the same in nu.)"""
         s = state[0]

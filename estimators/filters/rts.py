@@ -29,6 +29,7 @@ from ..physics.elimination import divide_into
 from ..physics.imu import BLOCK, predict, process_noise, sandwich
 from ..physics.so3 import inverse_right_jacobian_into
 from ..physics.state import STATE, as_belief, as_record, inject, local, turn_covariance, with_rate_noise
+from ..stages import stage
 from .eskf import ErrorStateKalman
 from .filter_pass import FilterOptions, FilterPass
 
@@ -95,6 +96,7 @@ class RauchTungStriebelPass:
         self._length = 0
         return Trajectory.from_beliefs(beliefs[::-1], lookahead_s=np.inf)
 
+    @stage("output")
     def _remember_epoch(self, epoch: Epoch, state: NDArray[Any], block: NDArray[Any]) -> None:
         """Write an epoch down; where nothing moved since the last one, as the same, later known better."""
         t_ns, tick = epoch.t_ns, epoch.tick
