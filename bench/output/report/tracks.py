@@ -14,8 +14,8 @@ from pyarrow.parquet import read_metadata
 from ....datasets.errors import one_line
 from ....datasets.state import POSITION, Array
 from ...results.summary import Record, groups
-from ..figures.track import Track, tracks_of
-from .sheets import lookahead
+from ..figures.track import Track, error_m, has_bounds, is_near, tracks_of
+from .curves import named
 
 POSES = 200_000
 """How many poses a page may hold; one is 48 bytes of it."""
@@ -110,10 +110,8 @@ def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]
         "truth": None if longest is None else _coordinates(longest.p_WB_W[::every, :2]),
         "tracks": [
             {
-                "label": track.label,
-                "output": track.output,
-                "ahead": lookahead(row),
-                "near": _is_near(track),
+                **named(row),
+                "near": is_near(track),
                 "t": floats(1e-9 * (track.estimate.t_ns[::every] - start_ns).astype(float)),
                 "p": _coordinates(track.estimate.p_WB_W[::every, :2]),
                 "error": _errors(track, every),
@@ -124,24 +122,17 @@ def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]
     }
 
 
-def _is_near(track: Track) -> bool:
-    """Whether a track keeps within the truth's own extent of it: one that got lost does not set a figure's scale."""
-    if track.truth is None:
-        return True
-    error_m = (track.estimate.p_WB_W - track.truth.p_WB_W)[:, :2]
-    return bool(np.nanmax(np.abs(error_m), initial=0.0) < max(np.ptp(track.truth.p_WB_W[:, :2], axis=0).max(), 1.0))
-
-
 def _errors(track: Track, every: int) -> list[str] | None:
     if track.truth is None:
         return None
-    return _coordinates(track.estimate.p_WB_W[::every] - track.truth.p_WB_W[::every])
+    return _coordinates(error_m(track)[::every])
 
 
 def _sigmas(track: Track, every: int) -> list[str] | None:
     """Return σ by axis; None where there is no covariance, or it is in other axes than the aligned error."""
-    if track.align != "none" or track.estimate.P is None or track.truth is None:
+    if not has_bounds(track):
         return None
+    assert track.estimate.P is not None
     variance = np.diagonal(track.estimate.P[::every, POSITION, POSITION], axis1=1, axis2=2)
     return _coordinates(np.sqrt(variance.clip(min=0)))
 

@@ -143,7 +143,7 @@ def test_the_terminals_table_and_the_csv_say_the_same(rows: pd.DataFrame, tmp_pa
     for _, row in table.iterrows():
         assert f"{row['ate_rmse_m']:.3g}" in text
     assert "alignment: none" in text
-    assert "against the truth" in text
+    assert "against ground truth" in text
     assert "–" in text  # dead reckoning's NEES
     assert "…" not in text
 
@@ -218,7 +218,7 @@ def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame
     assert honest["nis_gps"] is None  # it comes late
     assert summary["rts", "smoothed"]["nis_dvl"] is None
     text = printed(rows, tmp_path, 120)
-    lines = text[text.index("honesty") :].splitlines()
+    lines = text[text.index(": consistency") :].splitlines()
     of = {label: next(line for line in lines if line.startswith(label)) for label in JUDGED}
     assert f"▲{wrong['anees_velocity_above']}" in of["overconfident"]
     assert "▲" not in of["eskf"]
@@ -242,7 +242,7 @@ def test_the_widest_honesty_table_fits_120_columns(judged: tuple[pd.DataFrame, P
 
 
 def test_few_seeds_without_nis_have_no_honesty_table(rows: pd.DataFrame, tmp_path: Path) -> None:
-    assert "honesty" not in printed(rows, tmp_path)
+    assert ": consistency" not in printed(rows, tmp_path)
     assert "late readings" not in printed(rows, tmp_path)
 
 
@@ -359,7 +359,7 @@ def test_a_figure_is_as_wide_as_a_column_with_no_text_cut_off_nor_too_small(
 
 def test_a_label_is_drawn_as_it_stands(drawn: dict[str, Figure]) -> None:
     shown = [text.get_text() for legend in drawn["costs"].legends for text in legend.get_texts()]
-    assert [" ".join(text.split()).replace(r"\$", "$") for text in shown] == [*ODD, "with hindsight"]
+    assert [" ".join(text.split()).replace(r"\$", "$") for text in shown] == [*ODD, "smoothed"]
     assert not any(text.get_usetex() for text in texts(drawn["costs"]))
 
 

@@ -342,7 +342,7 @@ def test_the_printed_table_holds_the_differences() -> None:
         assert words in section
     assert f"{100 * (record['ratio'] - 1):+.0f}" in section
     assert "corrected by Holm for 1 tests" in " ".join(section.split())
-    assert "against" not in printed(rows, []).replace("nothing to score against", "")
+    assert "against" not in printed(rows, []).replace("no ground truth to score against", "")
 
 
 def test_the_printed_table_says_when_seeds_are_too_few_for_so_many_tests() -> None:
