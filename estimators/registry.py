@@ -14,8 +14,9 @@ from .filters.eskf_filterpy import FilterpyKalmanFilter
 from .filters.iekf import InvariantKalmanFilter
 from .filters.rts import RauchTungStriebelSmoother
 from .filters.ukf import UnscentedKalmanFilter
+from .graph.smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother
 from .interface import Estimator
-from .smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother, WindowSmoother
+from .window.smoother import WindowSmoother
 
 ESTIMATORS: dict[str, Any] = {
     "dead-reckoning": DeadReckoning,

@@ -1,44 +1,102 @@
-"""The smoothers: a fixed lag and the whole log, each incrementally and by batches, on GTSAM and on our own window."""
+"""What every smoother can be told, whatever solves it: on GTSAM (`graph`) or on our own solver (`window`)."""
 
 from __future__ import annotations
 
-import math
+from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
-import gtsam
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
 from ..datasets.rig import Rig
-from ..datasets.state import Array, Belief
-from .graph.graph_pass import GraphSmoother, GtsamSmoother, NonNegative, Positive
-from .graph.solvers import BatchLagSolver, BatchSolver, IncrementalSolver, Solver, isam2_params
-from .interface import Pass
-from .window.window_pass import Solving, WindowPass
+from ..datasets.state import Belief
+from .interface import FACTORS, Factors, Inflation, Pass
+from .robust import Losses
+
+DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+def _once(dvl: frozenset[DvlFactor]) -> frozenset[DvlFactor]:
+    if dvl >= {"preintegrated-loose", "preintegrated-tight"}:
+        raise ValueError(
+            "preintegrated-loose and preintegrated-tight sum the same readings, so each would be used twice: name one"
+        )
+    return dvl
 
 
 @dataclass(frozen=True)
-class IncrementalSmoother(GtsamSmoother):
-    """What the smoothers on iSAM2 can be told besides: how near the optimum they stay, and at what cost.
+class GraphSmoother(ABC):
+    """What every factor-graph smoother can be told; a kind of it says how it solves.
 
-    With relinearize and wildfire all 0 and two extra updates every step ends at the optimum of what is in the graph,
-    for a cost that grows with the length of the window.
+    A DVL reading makes a keyframe, or with keyframe_period_s the first one after that long. Where the DVL is silent for
+    keyframe_timeout_s, the next other reading makes one; where everything is silent, time does, so that no IMU factor
+    spans much more than a second. Between keyframes the belief is carried on and corrected as a filter would; the graph
+    does not see that.
 
     Attributes:
-        relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
-            linearises a variable anew. Position enters every factor linearly but for its rotation into B; under a
-            loss (`robust`), whose weights are renewed with the linearisation, give it a part of the sensor's sigma.
-        wildfire: an update goes down the tree as far as variables move by more than this (in their own units).
-        extra_updates: Gauss–Newton steps after the one that takes in new factors.
+        dvl: how DVL readings enter. "velocity": each by its own factor (eq. 4). "preintegrated-loose": summed to a
+            displacement from keyframe to keyframe (eq. 6), turned by the gyro at the bias of the moment, as if the IMU
+            factor had another gyro. "preintegrated-tight": the same displacement given the rotation between the
+            keyframes and the gyro bias, so that with the IMU factor each gyro sample counts once. One of these two
+            at most: over a second they differ little; over 5 s with a consumer's gyro, loose claims to know the
+            attitude too well. With "velocity" beside it, the reading at a keyframe goes by its velocity and the others
+            are summed, so that none is used twice. A reading that comes after its interval was closed goes by its
+            velocity whatever is said here. So does an interval with a reading that leaves an axis unmeasured (wheel
+            speed): as the vehicle turns, what is not known of one axis of B gets into every axis of the sum, and no
+            displacement is known. `not_summed` counts the readings of such intervals, and of those that max_hold_s
+            leaves out.
+        dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
+            straight, up to the reading at the interval's end (which so has a small part in two factors). Held, its
+            covariance knows the DVL's and the gyro's noise but not what is lost by holding: on a vehicle that
+            manoeuvres it claims too much.
+        keyframe_period_s: None for every DVL reading (1 s with a preintegrated factor).
+        keyframe_timeout_s: see above.
+        max_hold_s: an interval with a longer silence of the DVL is not preintegrated; its readings go by velocity.
+        merge_ns: a reading this close to a keyframe is taken as of it, and counted.
+        factors: the sensors it may use.
+        inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
+        robust: loss by sensor, "huber", "cauchy" or "tukey", of the widths of `robust`. Every factor of the sensor has
+            it; `outliers_<sensor>` counts the residuals that are beyond the width when their keyframe leaves. A weight
+            is as fresh as the linearisation of its factor, and stays as it is once a neighbour of its keyframe is
+            marginalised out. Tukey and, less so, Cauchy have no single minimum: what lies beyond the width at the
+            first guess, the IMU's prediction, has no pull and is not reconsidered unless others move the estimate. So
+            a vehicle that is lost by more than the width never hears that sensor again.
+        hindsight_covariance_s: period at which states with hindsight keep their covariance.
+        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
 
-    relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)
-    wildfire: NonNegative = 1e-3
-    extra_updates: Annotated[int, Field(ge=0)] = 0
+    dvl: Annotated[frozenset[DvlFactor], Field(min_length=1), AfterValidator(_once)] = frozenset({"velocity"})
+    dvl_between: Literal["held", "straight"] = "held"
+    keyframe_period_s: Positive | None = None
+    keyframe_timeout_s: Positive = 0.5
+    max_hold_s: Positive = 1.5
+    merge_ns: int = Field(default=5_000_000, ge=0)
+    factors: Factors = FACTORS
+    inflate: Inflation = Field(default_factory=dict)
+    robust: Losses = Field(default_factory=dict)
+    hindsight_covariance_s: Positive = 5.0
+    earth_rotation: bool = False
 
-    def isam2_params(self) -> gtsam.ISAM2Params:
-        """Return iSAM2's parameters."""
-        return isam2_params(self.factorization, self.relinearize, self.wildfire)
+    @property
+    @abstractmethod
+    def window_s(self) -> float:
+        """How long a state is kept before it leaves with what has been learnt of it; infinite for the whole log."""
+
+    @abstractmethod
+    def begin(self, prior: Belief, rig: Rig) -> Pass:
+        """See `Estimator.begin`."""
+
+    @property
+    def preintegrates(self) -> bool:
+        """Whether DVL readings are summed between keyframes."""
+        return self.dvl != {"velocity"}
+
+    @property
+    def period_s(self) -> float:
+        """Time between keyframes; 0 for one at every DVL reading."""
+        return self.keyframe_period_s or (1.0 if self.preintegrates else 0.0)
 
 
 @dataclass(frozen=True)
@@ -55,92 +113,3 @@ class LaggedSmoother(GraphSmoother):
     def window_s(self) -> float:
         """See `GraphSmoother.window_s`."""
         return self.lag_s
-
-
-@dataclass(frozen=True)
-class FixedLagSmoother(LaggedSmoother, IncrementalSmoother):
-    """MAP over the last lag_s seconds; older states are marginalised out (GTSAM's IncrementalFixedLagSmoother)."""
-
-    def solver(self, R_BI: Array) -> Solver:
-        """See `GtsamSmoother.solver`."""
-        return IncrementalSolver(self.isam2_params(), R_BI, self.lag_s, self.extra_updates)
-
-
-@dataclass(frozen=True)
-class BatchFixedLagSmoother(LaggedSmoother, GtsamSmoother):
-    """MAP over the last lag_s seconds, solved anew at every keyframe (GTSAM's BatchFixedLagSmoother).
-
-    The same estimate as an iSAM2 that linearises everything anew in every step; a keyframe's cost grows with the lag.
-    """
-
-    def solver(self, R_BI: Array) -> Solver:
-        """See `GtsamSmoother.solver`."""
-        return BatchLagSolver(self.factorization, R_BI, self.lag_s)
-
-
-@dataclass(frozen=True)
-class WindowSmoother(LaggedSmoother):
-    """MAP over the last lag_s seconds on our own solver: Gauss–Newton on the chain of keyframes (see `window_chain`).
-
-    The estimate of `fls`, by the same factors at the same keyframes. A step factors one block, those that were
-    linearised anew and all since, and goes back through the window once; `refactored` and `relinearised` count them.
-
-    Attributes:
-        relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units); a keyframe that
-            has moved beyond any of them is linearised anew.
-        extra_updates: Gauss–Newton steps after the one that takes in new factors, as long as anything moves beyond its
-            threshold. With thresholds of 0 and some ten, every step ends at the optimum.
-        relinearize_prior: also linearise anew what touches the marginal prior. GTSAM's smoothers leave that be.
-    """
-
-    relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)
-    extra_updates: Annotated[int, Field(ge=0)] = 0
-    relinearize_prior: bool = False
-
-    def begin(self, prior: Belief, rig: Rig) -> Pass:
-        """See `Estimator.begin`."""
-        return WindowPass(self, Solving(self.relinearize, self.extra_updates, self.relinearize_prior), prior, rig)
-
-
-@dataclass(frozen=True)
-class WholeLogSmoother(IncrementalSmoother):
-    """MAP over the whole log, incrementally (GTSAM's iSAM2, nothing marginalised)."""
-
-    hindsight_covariance_s: Positive = 60.0
-
-    @property
-    def window_s(self) -> float:
-        """Every state is kept to the end."""
-        return math.inf
-
-    def solver(self, R_BI: Array) -> Solver:
-        """See `GtsamSmoother.solver`."""
-        return IncrementalSolver(self.isam2_params(), R_BI, extra_updates=self.extra_updates)
-
-
-GUESS_KEYFRAMES = 50
-"""While a log lasts, `batch` on our own solver goes back so far for what it linearises anew."""
-
-
-@dataclass(frozen=True)
-class BatchSmoother(WholeLogSmoother):
-    """MAP over the whole log at its end: the best a smoother can do.
-
-    Attributes:
-        engine: "gtsam" is iSAM2 until then, which also gives the guess that Levenberg–Marquardt starts from. "window"
-            is our own solver (`window_chain`): a filter that goes back a little while the log lasts, then Gauss–Newton
-            over all of it. One optimum; the second is there in a hundredth of the time.
-    """
-
-    engine: Literal["gtsam", "window"] = "gtsam"
-
-    def begin(self, prior: Belief, rig: Rig) -> Pass:
-        """See `Estimator.begin`."""
-        if self.engine == "gtsam":
-            return super().begin(prior, rig)
-        solving = Solving(self.relinearize, self.extra_updates, reach=GUESS_KEYFRAMES, to_optimum=True)
-        return WindowPass(self, solving, prior, rig)
-
-    def solver(self, R_BI: Array) -> Solver:
-        """See `GtsamSmoother.solver`."""
-        return BatchSolver(self.isam2_params(), R_BI, self.factorization, self.extra_updates)

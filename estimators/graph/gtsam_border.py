@@ -7,17 +7,18 @@ Everything is converted here and nowhere else.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, L, V, X
 from numba import njit
 from numpy.typing import NDArray
 
-from ...datasets.epochs import ATTITUDE, DEPTH, GPS, HEADING
+from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged
 from ..physics.dvl_preintegration import given_rotation
@@ -25,6 +26,7 @@ from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, pro
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import cross, exp, inverse_right_jacobian, inverse_transform, log, product, right_jacobian, transform
 from ..physics.state import STATE, local
+from ..stages import stage
 
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
@@ -82,6 +84,7 @@ def equivalent_samples(
     return accel + transform(g.R_BI, b.b_a), gyro + transform(g.R_BI, b.b_g), dts[1:]
 
 
+@stage("propagation")
 def preintegrate_imu(
     imu: NDArray[Any], before: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], p_WB_W: Array = ZERO
 ) -> gtsam.PreintegratedCombinedMeasurements:
@@ -174,6 +177,7 @@ def _carried_covariance(reading: NDArray[Any], block: NDArray[Any], state: NDArr
     return H[:n] @ Q @ H[:n].T + C[:n, :n]
 
 
+@stage("linearisation")
 def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.NonlinearFactor:
     """Return the factor of a reading that was true at keyframe i: GTSAM's own where it has one.
 
@@ -181,8 +185,13 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
         i: keyframe.
         reading: one READING row.
         rig: RIG record.
+
+    Raises:
+        ValueError: the reading is of no known kind.
     """
     row, g = reading[0], rig[0]
+    if not 0 <= row["kind"] < len(SENSOR):
+        raise ValueError(f"a reading of unknown kind {row['kind']}; the kinds are 0 to {len(SENSOR) - 1}")
     sigma = row["sigma"] * g["inflate"][row["kind"]]
     if row["kind"] == DEPTH:
         model = gtsam.noiseModel.Diagonal.Sigmas(np.array([np.inf, np.inf, sigma[0]]))
@@ -193,13 +202,15 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
         R_WB = row["z"].reshape(3, 3) @ g["R_BH"].T
         return gtsam.PoseRotationPrior3D(X(i), gtsam.Rot3(R_WB), gtsam.noiseModel.Diagonal.Sigmas(sigma))
 
-    def only_pose(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+    @stage("linearisation")
+    def pose_callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         r, H_x, _, _ = _linearise(reading, NO_BLOCK, False, values.atPose3(X(i)).matrix(), ZERO, NO_BIAS, rig)
         if jacobians is not None:
             jacobians[0] = H_x
         return r
 
-    def pose_and_velocity(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+    @stage("linearisation")
+    def velocity_callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         pose, v_WB_W = values.atPose3(X(i)).matrix(), values.atVector(V(i))
         r, H_x, H_v, _ = _linearise(reading, NO_BLOCK, False, pose, v_WB_W, NO_BIAS, rig)
         if jacobians is not None:
@@ -207,12 +218,14 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
         return r
 
     if row["kind"] == HEADING:
-        return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma[0]), [X(i)], only_pose)
+        return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma[0]), [X(i)], pose_callback)
+    assert row["kind"] == DVL, "a kind without a factor"
     measured = np.isfinite(sigma)
     cov = np.diag(sigma[measured] ** 2) + g["rate_cov"][np.ix_(measured, measured)]
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), V(i)], pose_and_velocity)
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), V(i)], velocity_callback)
 
 
+@stage("linearisation")
 def carried_factor(
     i: int, reading: NDArray[Any], block: NDArray[Any], at_i: NDArray[Any], rig: NDArray[Any]
 ) -> gtsam.CustomFactor:
@@ -227,7 +240,8 @@ def carried_factor(
     """
     model = gtsam.noiseModel.Gaussian.Covariance(_carried_covariance(reading, block, at_i, rig))
 
-    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+    @stage("linearisation")
+    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         pose, v_WB_W = values.atPose3(X(i)).matrix(), values.atVector(V(i))
         bias = values.atConstantBias(B(i)).vector()
         r, H_x, H_v, H_b = _linearise(reading, block, True, pose, v_WB_W, bias, rig)
@@ -235,7 +249,7 @@ def carried_factor(
             jacobians[0], jacobians[1], jacobians[2] = H_x, H_v, H_b
         return r
 
-    return gtsam.CustomFactor(model, [X(i), V(i), B(i)], error)
+    return gtsam.CustomFactor(model, [X(i), V(i), B(i)], callback)
 
 
 @njit(cache=True)
@@ -246,17 +260,19 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
     return r, _by_gtsam(H_i, R_i, np.eye(3))[0], _by_gtsam(H_j, R_j, np.eye(3))[0]
 
 
+@stage("linearisation")
 def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.CustomFactor:
     """Return the loose preintegrated-DVL factor (eq. 6) between two keyframes."""
 
-    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+    @stage("linearisation")
+    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
         r, H_i, H_j = _linearise_displacement(pose_i, pose_j, dp_ij)
         if jacobians is not None:
             jacobians[0], jacobians[1] = H_i, H_j
         return r
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], callback)
 
 
 @njit(cache=True)
@@ -272,6 +288,7 @@ def _linearise_tight_displacement(
     return r, H_x, _by_gtsam(H_j, R_j, R_BI)[0], H_b
 
 
+@stage("linearisation")
 def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
     """Return the tight preintegrated-DVL factor: the displacement given the rotation and the gyro bias of keyframe i.
 
@@ -283,7 +300,8 @@ def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: N
     K, cov = given_rotation(displacement[0]["N"])
     R_BI = rig[0]["R_BI"]
 
-    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+    @stage("linearisation")
+    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
         bias = values.atConstantBias(B(i)).vector()
         r, H_i, H_j, H_b = _linearise_tight_displacement(displacement, K, pose_i, pose_j, bias, R_BI)
@@ -291,7 +309,7 @@ def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: N
             jacobians[0], jacobians[1], jacobians[2] = H_i, H_j, H_b
         return r
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], callback)
 
 
 @njit(cache=True)
@@ -312,17 +330,44 @@ def _linearise_prior(
     return r, H_x, H_v, H_b
 
 
+@stage("linearisation")
 def prior_factor(prior: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
     """Return the prior (a STATE record, its whole P) as one factor on keyframe 0."""
 
-    def error(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+    @stage("linearisation")
+    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         pose, v_WB_W = values.atPose3(X(0)).matrix(), values.atVector(V(0))
         r, H_x, H_v, H_b = _linearise_prior(prior, pose, v_WB_W, values.atConstantBias(B(0)).vector(), rig[0]["R_BI"])
         if jacobians is not None:
             jacobians[0], jacobians[1], jacobians[2] = H_x, H_v, H_b
         return r
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(prior[0]["P"]), [X(0), V(0), B(0)], error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(prior[0]["P"]), [X(0), V(0), B(0)], callback)
+
+
+def linearise_alike(state: NavState, R_BI: Array) -> tuple[Callable[[int], None], Callable[[int], None]]:
+    """Return two functions that linearise a factor n times: ours of a displacement, and a native one of that size.
+
+    The native one is GTSAM's of a point in two frames; both are 3 × 12. For `fathom timing`.
+
+    Args:
+        state: where both are linearised.
+        R_BI: the IMU's mounting.
+    """
+    values = gtsam.Values()
+    for i in range(2):
+        insert_state(values, i, state, R_BI)
+        values.insert(L(i), np.ones(3))
+    cov = 1e-4 * (np.eye(3) + 0.1)
+    ours = displacement_factor(0, 1, np.ones(3), cov)
+    native = gtsam.ReferenceFrameFactorPoint3Pose3(L(0), X(0), L(1), gtsam.noiseModel.Gaussian.Covariance(cov))
+    assert {factor.linearize(values).jacobian()[0].shape for factor in (ours, native)} == {(3, 12)}
+
+    def many(factor: Any, n: int) -> None:
+        for _ in range(n):
+            factor.linearize(values)
+
+    return partial(many, ours), partial(many, native)
 
 
 def insert_state(values: gtsam.Values, i: int, state: NavState, R_BI: Array) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from ...datasets.state import Array, Belief, NavState
+from ..stages import clock, stage
 from .gtsam_border import as_covariance, as_state
 
 Thresholds = tuple[float, float, float, float]
@@ -32,6 +33,10 @@ class Solver(Protocol):
 
     def finish(self) -> None:
         """There will be no more factors."""
+        ...
+
+    def work(self) -> dict[str, int]:
+        """Return how much was done: `factor_slots` now, and variables `relinearised` while `stages.clock` ran."""
         ...
 
 
@@ -76,7 +81,7 @@ class IncrementalSolver:
     def __init__(
         self, params: gtsam.ISAM2Params, R_BI: Array, lag_s: float | None = None, extra_updates: int = 0
     ) -> None:
-        self._R_BI, self._extra_updates = R_BI, extra_updates
+        self._R_BI, self._extra_updates, self._relinearised = R_BI, extra_updates, 0
         self._lagged = None if lag_s is None else gtsam.IncrementalFixedLagSmoother(lag_s + EDGE_S, params)
         self._isam2 = gtsam.ISAM2(params) if self._lagged is None else None
 
@@ -89,19 +94,24 @@ class IncrementalSolver:
         """The tree itself, for its marginals and its factors."""
         return self._isam2 or self._estimates.getISAM2()
 
+    @stage("solve")
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[Any, Any]) -> None:
         """See `Solver.update`."""
         if self._lagged is None:
             self.isam2.update(graph, values)
         else:
             self._lagged.update(graph, values, stamps)
+        self._count()
         for _ in range(self._extra_updates):
             self._estimates.update()
+            self._count()
 
+    @stage("solve")
     def state(self, i: int) -> NavState:
         """See `Solver.state`."""
         return _estimate(self._estimates, i, self._R_BI)
 
+    @stage("marginal")
     def belief(self, i: int, t_ns: int) -> Belief:
         """See `Solver.belief`."""
         state = self.state(i)
@@ -109,8 +119,17 @@ class IncrementalSolver:
         linearised_at = self.isam2.getLinearizationPoint().atPose3(X(i)).rotation().matrix()
         return Belief(t_ns, state, as_covariance(joint, state.R_WB, self._R_BI, linearised_at))
 
+    @stage("solve")
     def finish(self) -> None:
         """iSAM2 has nothing left to do."""
+
+    def work(self) -> dict[str, int]:
+        """See `Solver.work`."""
+        return {"factor_slots": self.isam2.getFactorsUnsafe().size(), "relinearised": self._relinearised}
+
+    def _count(self) -> None:
+        if clock.running and self._lagged is not None:
+            self._relinearised += self._lagged.getISAM2Result().getVariablesRelinearized()
 
 
 class BatchLagSolver:
@@ -124,14 +143,17 @@ class BatchLagSolver:
         self._R_BI = R_BI
         self._smoother = gtsam.BatchFixedLagSmoother(lag_s + EDGE_S, levenberg_marquardt_params(factorization))
 
+    @stage("solve")
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[Any, Any]) -> None:
         """See `Solver.update`."""
         self._smoother.update(graph, values, stamps)
 
+    @stage("solve")
     def state(self, i: int) -> NavState:
         """See `Solver.state`."""
         return _estimate(self._smoother, i, self._R_BI)
 
+    @stage("marginal")
     def belief(self, i: int, t_ns: int) -> Belief:
         """See `Solver.belief`. The smoother keeps no factorisation: the window is eliminated anew, by QR, down to i."""
         state, keys, order = self.state(i), [X(i), V(i), B(i)], gtsam.Ordering()
@@ -142,8 +164,13 @@ class BatchLagSolver:
         S = np.linalg.inv(np.linalg.qr(A, mode="r"))
         return Belief(t_ns, state, as_covariance(S @ S.T, state.R_WB, self._R_BI))
 
+    @stage("solve")
     def finish(self) -> None:
         """Every update has converged."""
+
+    def work(self) -> dict[str, int]:
+        """See `Solver.work`."""
+        return {}
 
 
 def _estimate(source: Any, i: int, R_BI: Array) -> NavState:
@@ -164,11 +191,13 @@ class BatchSolver(IncrementalSolver):
         self._every_factor = gtsam.NonlinearFactorGraph()
         self._optimum: gtsam.Values | None = None
 
+    @stage("solve")
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[Any, Any]) -> None:
         """See `Solver.update`."""
         super().update(graph, values, stamps)
         self._every_factor.push_back(graph)
 
+    @stage("solve")
     def state(self, i: int) -> NavState:
         """See `Solver.state`."""
         optimum = self._optimum
@@ -177,6 +206,7 @@ class BatchSolver(IncrementalSolver):
         pose, bias = optimum.atPose3(X(i)), optimum.atConstantBias(B(i))
         return as_state(pose, optimum.atVector(V(i)), bias, self._R_BI)
 
+    @stage("solve")
     def finish(self) -> None:
         """Solve the whole log."""
         params = levenberg_marquardt_params(self._factorization)

@@ -19,9 +19,9 @@ from fathom.datasets.state import VELOCITY
 from fathom.estimators import create
 from fathom.estimators.alignment.initialise import initialise
 from fathom.estimators.graph.gtsam_border import carried_factor, reading_factor
+from fathom.estimators.graph.losses import rows
 from fathom.estimators.physics.imu import BLOCK, compile_rig
 from fathom.estimators.physics.state import as_record
-from fathom.estimators.robust import rows
 from scipy.stats import chi2
 
 FLEET: dict[str, tuple[str, dict[str, Any]]] = {

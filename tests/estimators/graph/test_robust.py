@@ -18,9 +18,10 @@ from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import GpsSpec
 from fathom.estimators import FACTORS, create
 from fathom.estimators.graph.gtsam_border import carried_factor, displacement_factor, insert_state, reading_factor
+from fathom.estimators.graph.losses import distance, m_estimator, rows, with_loss
 from fathom.estimators.physics.imu import BLOCK, compile_rig, integrate
 from fathom.estimators.physics.state import as_record
-from fathom.estimators.robust import WIDTHS, Loss, distance, m_estimator, rows, width, with_loss
+from fathom.estimators.robust import WIDTHS, Loss, width
 from paths import Path, random_rig, random_rotation, random_state, reading
 from scipy.integrate import quad
 from scipy.stats import binom, chi2, norm

@@ -1,0 +1,38 @@
+"""The fixed-lag smoother on our own solver."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from ...datasets.rig import Rig
+from ...datasets.state import Belief
+from ..interface import Pass
+from ..smoothers import LaggedSmoother, NonNegative
+from .window_pass import Solving, WindowPass
+
+
+@dataclass(frozen=True)
+class WindowSmoother(LaggedSmoother):
+    """MAP over the last lag_s seconds on our own solver: Gauss–Newton on the chain of keyframes (see `window_chain`).
+
+    The estimate of `fls`, by the same factors at the same keyframes. A step factors one block, those that were
+    linearised anew and all since, and goes back through the window once; `refactored` and `relinearised` count them.
+
+    Attributes:
+        relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units); a keyframe that
+            has moved beyond any of them is linearised anew.
+        extra_updates: Gauss–Newton steps after the one that takes in new factors, as long as anything moves beyond its
+            threshold. With thresholds of 0 and some ten, every step ends at the optimum.
+        relinearize_prior: also linearise anew what touches the marginal prior. GTSAM's smoothers leave that be.
+    """
+
+    relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)
+    extra_updates: Annotated[int, Field(ge=0)] = 0
+    relinearize_prior: bool = False
+
+    def begin(self, prior: Belief, rig: Rig) -> Pass:
+        """See `Estimator.begin`."""
+        return WindowPass(self, Solving(self.relinearize, self.extra_updates, self.relinearize_prior), prior, rig)
