@@ -8,8 +8,8 @@ eliminated in the covariance form, in which nothing cancels:
     N(m_given, P_given)  of δ_j, given the same and the rows of both
     G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back substitution
 
-A row is r + H δ (+ H_j δ_j), of some variance. Inner loops run along rows of fixed length, so that they compile to vector
-instructions.
+A row is r + H δ (+ H_j δ_j), of some variance. Inner loops run along rows of fixed length, so that they compile to
+vector instructions.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def absorb_joint_row(
     r: float, h_i: Array, h_j: Array, variance: float,
     m_i: Array, P_i: Array, m_j: Array, P_j: Array, P_ji: Array,
 ) -> bool:  # fmt: skip
-    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji being cov(δ_j, δ_i); eq. (5) for a row (3)."""
+    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji = cov(δ_j, δ_i); eq. (5) for a row (3)."""
     PH = np.zeros((2, DIM))
     PH_i, PH_j = PH[0], PH[1]
     for k in range(DIM):

@@ -212,7 +212,7 @@ def linearise_tie(
 
 @compiled
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
-    """Fill N(m, P) of the error at x that N(mean, anchor.P) of the error at the anchor makes, eq. (10); STATE records."""
+    """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor, STATE records; eq. (10)."""
     J, lacking = np.empty((3, 3)), np.empty(3)
     local(anchor, x, m)
     right_jacobian_into(m[THETA], J)
