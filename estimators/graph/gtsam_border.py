@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
-from ..interface import Diverged
+from ..interface import Diverged, unknown_kind
 from ..physics.dvl_preintegration import given_rotation
 from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
@@ -192,7 +192,7 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
     """
     row, g = reading[0], rig[0]
     if not 0 <= row["kind"] < len(SENSOR):
-        raise ValueError(f"a reading of unknown kind {row['kind']}; the kinds are 0 to {len(SENSOR) - 1}")
+        raise unknown_kind(row["kind"])
     sigma = row["sigma"] * g["inflate"][row["kind"]]
     if row["kind"] == DEPTH:
         model = gtsam.noiseModel.Diagonal.Sigmas(np.array([np.inf, np.inf, sigma[0]]))
