@@ -4,6 +4,7 @@
 - `physics`: rotations, the state, the IMU block, one residual and Jacobian per sensor, elimination; compiled.
 - `alignment`: the belief at the start of a log that states none.
 - `filters`: `eskf`, `eskf-filterpy`, `iekf`, `ukf`, and `rts` on top of `eskf`.
+- `keyframes`: which reading makes a keyframe, decided once for every smoother.
 - `graph`: smoothers on GTSAM, the only folder that imports it; `window`: our own smoother, compiled.
 - `dead_reckoning`: no fusion, to compare with.
 
