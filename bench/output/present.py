@@ -58,7 +58,7 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     old = others.index[outdated(others, plan)]
     every = every.drop(old)
     console = terminal.console()
-    print_logs(rows.loc[~rows["log"].isin(printed)], console)
+    print_logs(rows.loc[~rows["log"].isin(list(printed))], console)
     differences = paired(every, plan.comparisons(), plan.compare)
     shown = set(zip(rows["log"], rows["label"], strict=True))
     print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
