@@ -22,7 +22,7 @@ fast: .venv/dev lint
 	$(PYTEST) -m 'not slow'
 
 timing: .venv/dev
-	$(BIN)/fathom timing
+	$(BIN)/fathom timing budgets
 
 # results/reference/*.csv anew; recorded logs among them where FATHOM_DATA has them
 reference: .venv/core

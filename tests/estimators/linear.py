@@ -14,7 +14,7 @@ from fathom.estimators.filters.eskf_filterpy import stack
 from fathom.estimators.graph.gtsam_border import LEAST_WALK
 from fathom.estimators.interface import FACTORS
 from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise
-from fathom.estimators.physics.records import as_belief, as_record, with_rate_noise
+from fathom.estimators.physics.state import as_belief, as_record, with_rate_noise
 from paths import GRAVITY, random_rotation, reading
 from scipy.spatial.transform import Rotation
 

@@ -13,7 +13,7 @@ from fathom.datasets.epochs import IMU_SAMPLE, READING
 from fathom.estimators import FACTORS
 from fathom.estimators.physics.imu import compile_rig
 from fathom.estimators.physics.measurements import measure
-from fathom.estimators.physics.records import as_record
+from fathom.estimators.physics.state import as_record
 from scipy.spatial.transform import Rotation
 
 NOISE = ImuNoise(4e-5, 1e-3, 1e-6, 3e-5, 5e-5, 7e-3)

@@ -17,7 +17,8 @@ from fathom.bench.metrics.floor_ratio import rmse_over_floor, squares
 from fathom.datasets import Belief, Log, Trajectory
 from fathom.datasets.epochs import SENSOR, cut
 from fathom.datasets.log import ImuStream
-from fathom.datasets.simulated.scenario import IMU_GRADES, Scenario
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
+from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec
 from fathom.datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY

@@ -12,7 +12,8 @@ from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, Epoch, cut
 from fathom.datasets.log import DvlStream, ImuStream
 from fathom.datasets.mounting import MountingSpec
-from fathom.datasets.simulated.scenario import IMU_GRADES, Scenario
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
+from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, ImuSpec
 from fathom.estimators import FACTORS, Diverged, Pass, create
