@@ -18,10 +18,13 @@ from typing import Annotated, Literal
 import numpy as np
 
 from .interface import FACTORS, sensors_among
+from .physics.compiled import compiled
 
 Loss = Literal["huber", "cauchy", "tukey"]
 WIDTHS: dict[Loss, float] = {"huber": 1.345, "cauchy": 2.3849, "tukey": 4.6851}
 """Sigmas, for one row."""
+LOSSES: tuple[str, ...] = ("", "huber", "cauchy", "tukey")
+"""Losses by number, for compiled code; 0 is none."""
 Losses = Annotated[dict[str, Loss], sensors_among(FACTORS)]
 """Loss by sensor; a sensor that is not named has none."""
 
@@ -32,3 +35,15 @@ def width(loss: Loss, n: int) -> float:
     from scipy.stats import chi2  # slow to import, and only losses need it
 
     return float(np.sqrt(chi2.isf(chi2.sf(WIDTHS[loss] ** 2, 1), n)))
+
+
+@compiled
+def weight_of(loss: int, d: float, width: float) -> float:
+    """w(d), of the loss by its place in LOSSES."""
+    if loss == 1:
+        return 1.0 if d <= width else width / d
+    if loss == 2:
+        return 1.0 / (1.0 + (d / width) ** 2)
+    if loss == 3:
+        return (1.0 - (d / width) ** 2) ** 2 if d <= width else 0.0
+    return 1.0

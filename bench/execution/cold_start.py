@@ -1,64 +1,159 @@
-"""Compile before many processes would each compile the same, and say so: the first time, it takes minutes."""
+"""Compile before workers start: otherwise each of them would compile the same code, minutes of computing each.
+
+One process per core compiles, one estimator at a time; all of them, and the workers later, share the cache of compiled
+code. Whatever goes wrong here is left to the workers.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
 import sys
-from collections.abc import Iterable
-from contextlib import suppress
-from hashlib import sha256
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, cast
 
-import llvmlite.binding as llvm
-import numba
 from rich.console import Console
 
 from ... import estimators
+from ...estimators.compiled_cache import compiled_folder
 from ...estimators.interface import Estimator
-from ...estimators.physics.imu import integrate
-from ...estimators.registry import EstimatorError
 from ..experiment.plan import plain
+from .child import Child, start
 
-NOTICE = "compiling the estimators, once on this machine; this takes minutes"
+NOTICE = "compiling the estimators, once on this machine; this takes a minute or two"
+HEAVIEST = ("WindowSmoother", "BatchSmoother", "UnscentedKalmanFilter", "InvariantKalmanFilter")
+"""Kinds that take longest to compile, in this order; they go first, so that no core ends with a long one alone."""
+SERVE = f"{__name__}:serve"
 
 
 def compile_first(wanted: Iterable[Estimator]) -> None:
-    """Compile what the estimators need and no earlier run has compiled, in one process; nothing to do as a rule.
+    """Compile what the estimators need and no earlier run has compiled; as a rule there is nothing to do.
 
-    Every worker would compile it all by itself, a minute's computing or two and hundreds of megabytes each. Where
-    anything is compiled there is a line on stderr, and on a terminal what is being done. Estimators of other packages
-    are left to their workers; so is whatever goes wrong here.
+    Progress goes to standard error, and only where something is compiled: on a terminal as a line that changes, else as
+    one line for each estimator. Estimators of other packages are left to their workers.
     """
     own = f"{estimators.__name__}."
     unknown = {code_of(one): one for one in wanted if type(one).__module__.startswith(own)}
     with suppress(OSError):
         for code in warm():
             unknown.pop(code, None)
-    if not unknown:
-        return
-    from ..timing.driver import Driver
+    queue = sorted(unknown.items(), key=lambda each: _weight(each[1]), reverse=True)
+    progress = Progress(len(queue))
+    with progress.shown(), ExitStack() as children:
+        busy: dict[Any, tuple[Child, str, str]] = {}  # by connection: the child, the code it compiles, and for whom
 
-    said: list[str] = []
-    console = Console(stderr=True)
-    with (
-        console.status("looking for compiled code") as status,
-        Driver(probed=False) as driver,
-        suppress(EstimatorError),
-    ):
+        def hand_over(child: Child) -> None:
+            if queue:
+                code, estimator = queue.pop(0)
+                busy[child.connection] = child, code, type(estimator).__name__
+                child.connection.send(estimator)
 
-        def compiling(function: str) -> None:
-            if not said:
-                print(NOTICE, file=sys.stderr, flush=True)
-            said.append(function)
-            status.update(f"compiling for {name}: {function}, {len(said)} functions so far")
+        for _ in range(min(len(queue), _cores())):
+            hand_over(children.enter_context(start(SERVE)))
+        while busy:
+            for connection in wait(list(busy)):
+                child, code, kind = busy[connection]
+                try:
+                    said = cast(Any, connection).recv()
+                    if isinstance(said, str):
+                        progress.compiling(kind, said)
+                        continue
+                    del busy[connection]
+                    if said:
+                        remember(code)
+                    hand_over(child)
+                except (OSError, EOFError):  # the process died; what it left undone is left to the workers
+                    busy.pop(connection, None)
+                progress.done(kind)
 
-        for code, estimator in unknown.items():
-            name = type(estimator).__name__
-            driver.warm_up(estimator, compiling)
-            remember(code)
+
+def _weight(estimator: Estimator) -> int:
+    kind = type(estimator).__name__
+    return len(HEAVIEST) - HEAVIEST.index(kind) if kind in HEAVIEST else 0
+
+
+def _cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Progress:
+    """What is said of compiling, on standard error, once the first function is compiled.
+
+    Args:
+        estimators: how many there are to compile for.
+    """
+
+    def __init__(self, estimators: int) -> None:
+        self._console = Console(stderr=True)
+        self._status = self._console.status("looking for compiled code")
+        self._estimators, self._done, self._functions = estimators, 0, 0
+        self._began_s = time.monotonic()
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """Show the line that changes, on a terminal, where there is anything to do."""
+        if not self._estimators or not self._console.is_terminal:
+            yield
+            return
+        with self._status:
+            yield
+
+    def compiling(self, kind: str, function: str) -> None:
+        """Say that a function is compiled for a kind of estimator."""
+        if not self._functions:
+            print(NOTICE, file=sys.stderr, flush=True)
+        self._functions += 1
+        self._status.update(
+            f"compiling for {kind}: {function}; {self._functions} functions so far, "
+            f"{self._done} of {self._estimators} estimators done"
+        )
+
+    def done(self, kind: str) -> None:
+        """Say that an estimator is compiled."""
+        self._done += 1
+        if self._functions and not self._console.is_terminal:
+            elapsed_s = time.monotonic() - self._began_s
+            line = f"compiled for {kind}, {self._done} of {self._estimators}: {self._functions} functions"
+            print(f"{line}, {elapsed_s:.0f} s", file=sys.stderr, flush=True)
+
+
+def serve(connection: Any) -> None:
+    """Compile for one estimator after the other: the child's side.
+
+    For each, sends the name of every function of ours that it compiles, then whether all went well.
+    """
+    from numba.core import event
+
+    from .drive import warm_up
+
+    class Tell(event.Listener):
+        def on_start(self, event: Any) -> None:
+            function = event.data["dispatcher"].py_func
+            if function.__module__.startswith(__name__.partition(".")[0]):
+                connection.send(function.__name__)
+
+        def on_end(self, event: Any) -> None:
+            """Nothing to say."""
+
+    event.register("numba:compile", Tell())
+    while True:
+        try:
+            estimator = connection.recv()
+        except EOFError:
+            return
+        try:
+            warm_up(estimator)
+        except Exception:  # its run will say so
+            connection.send(False)
+        else:
+            connection.send(True)
 
 
 def code_of(estimator: Estimator) -> str:
@@ -80,8 +175,5 @@ def remember(code: str) -> None:
 
 
 def _stamp() -> Path:
-    """Return a file that lies with the compiled code, and is another for other sources, versions and processors."""
-    folder = Path(estimators.__file__).parent
-    sources = [f"{path.name} {path.stat().st_mtime_ns} {path.stat().st_size}" for path in sorted(folder.rglob("*.py"))]
-    state = [*sources, sys.version, numba.__version__, llvm.get_host_cpu_name()]
-    return Path(str(integrate.stats.cache_path)) / f"warm-{sha256(repr(state).encode()).hexdigest()[:12]}.txt"
+    """Return a file that lies with the compiled code: another for other sources, versions and processors."""
+    return compiled_folder() / "warm.txt"

@@ -1,8 +1,7 @@
 """The same runs on a Dask cluster: descriptions go there, rows and trajectories come back.
 
-Each worker has one task at a time, and each task one worker; so a worker's death is that task's, which another worker
-then tries. What is not under way stays here: the scheduler holds one small task per worker, however many runs there
-are.
+Each worker has one task at a time. If a worker dies, another worker tries its task. Tasks that are not yet running stay
+here: the scheduler holds one small task per worker, however many runs there are.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 TRIES = 3
-"""A run that so many workers were lost with is not given to another."""
+"""After so many lost workers a run is recorded as failed: it is then more likely the cause than bad luck is."""
 
 CONNECT_S = 15.0
-"""How long a scheduler may take to answer."""
+"""How long a scheduler may take to answer, s; one on another continent takes less than one."""
 
 LOOK_S = 1.0
-"""How often one looks which workers have come and gone."""
+"""How often the list of workers is read, s; runs take longer than that."""
 
 ASSEMBLE_S = 30.0
-"""How long the first runs wait for workers that are there, but busy."""
+"""How long the first runs wait until all workers have said which versions they have, s; a busy one may not answer."""
 
 FETCH_S = 60.0
-"""How long a worker that has finished may take to hand over what it has."""
+"""How long a finished worker may take to send its rows and trajectories, s; some megabytes."""
 
 
 def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable[[str], None]) -> Generator[Finished]:
@@ -53,7 +52,7 @@ def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable
         address: of a scheduler ("tcp://host:8786"), or its scheduler file (.json); or "local", which makes a cluster of
             processes here for as long as this lasts.
         jobs: worker processes of a local cluster; 0 for one per core.
-        say: called with what somebody who waits should know.
+        say: called with messages for the user.
 
     Raises:
         ExperimentError: the extra is missing; the scheduler cannot be reached, or is lost; a worker computes with other
@@ -90,7 +89,7 @@ def _connected(address: str, jobs: int) -> Iterator[Client]:
             yield client
         return
     if jobs:
-        raise ExperimentError(f"--jobs {jobs}: how many workers there are is the affair of the cluster at {address}")
+        raise ExperimentError(f"--jobs {jobs}: only for --dask local; the cluster at {address} has its own workers")
     try:
         client = Client(_scheduler(address), timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
@@ -162,7 +161,7 @@ class _Crew:
             self._dismiss()
 
     def _look(self) -> Iterator[Finished]:
-        """Notice who has gone, and whose task failed with that; greet who has come."""
+        """Find workers that left, and put their tasks back; ask new ones for their versions."""
         if monotonic() < self.look_at_s:
             return
         workers: Any = self.client.nthreads()
@@ -184,7 +183,7 @@ class _Crew:
         return future
 
     def _hand_out(self) -> None:
-        """Give every idle worker a task, once those who were there at first have said what they compute with."""
+        """Give every idle worker a task, once the first workers have said which versions they have."""
         if not self.begun and monotonic() < self.assembled_by_s and not all(h.greeting for h in self.hands.values()):
             return
         for hand in self.hands.values():
@@ -217,7 +216,7 @@ class _Crew:
             yield answer
 
     def _meet(self, hand: _Hand, answer: Greeting) -> None:
-        """Let a worker join, unless it would compute something else than its rows say."""
+        """Accept a worker whose versions are those of this process; its rows would otherwise name the wrong ones."""
         hand.greeting = answer
         mine, theirs = self.ours.versions, answer.versions
         differ = [
@@ -240,7 +239,7 @@ class _Crew:
         self.say(f"worker {hand.address} is left out: {why}")
 
     def _failed(self, hand: _Hand, error: Exception) -> Iterator[Finished]:
-        """Take what Dask says of a call that did not come to its end."""
+        """Handle an error that Dask reports for a call."""
         from distributed import CancelledError, KilledWorker
 
         if isinstance(error, CancelledError | KilledWorker | OSError | TimeoutError):
@@ -254,7 +253,7 @@ class _Crew:
             yield Finished([task.row("failed", f"{type(error).__name__}: {error}") | _provenance(hand)])
 
     def _lost(self, hand: _Hand) -> Iterator[Finished]:
-        """Put the task of a worker that is gone back, unless it has cost too many."""
+        """Put back the task of a lost worker, unless it has lost TRIES workers."""
         self.client.cancel([hand.future], force=True)
         task = hand.task
         if task is None:
@@ -269,7 +268,7 @@ class _Crew:
             yield Finished([task.row("failed", cause) | _provenance(hand)])
 
     def _dismiss(self) -> None:
-        """Leave nothing behind: no task at the scheduler, no process at the workers."""
+        """Cancel all tasks at the scheduler and end the processes on the workers."""
         with suppress(OSError, TimeoutError, RuntimeError):
             self.client.cancel([hand.future for hand in self.hands.values()], force=True)
             self.client.run(dismiss, self.sweep, workers=list(self.hands), on_error="ignore")

@@ -1,10 +1,10 @@
-"""On a worker of a Dask cluster: who it is, and a run at a time, in a process like a local worker's.
+"""What runs on a worker of a Dask cluster: one run at a time, in a process like a local worker's.
 
-The run has a process of its own because Dask's must go on answering: GTSAM holds Python's lock through long calls, and
-a worker that is silent for minutes is taken for dead. It also keeps Dask's own work out of the timings, and costs no
-more than itself when it crashes or hangs.
+The run has a process of its own, because Dask's process must answer the scheduler: GTSAM holds Python's lock through
+long calls, and a worker that is silent for minutes counts as dead. The process also keeps Dask's work out of the
+timings, and a crash or hang costs one run.
 
-The scheduler imports this module, too; so the rest of the package waits inside the functions.
+The scheduler imports this module too, so the rest of the package is imported inside the functions.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Greeting:
-    """What a worker computes with.
+    """The versions that a worker computes with.
 
     Attributes:
-        versions: as `ledger.versions` gives them, and of the packages that estimators come from.
+        versions: as `identity.versions` gives them, and of the packages that estimators come from.
         provenance: what its rows say of commit, versions and machine.
         threads: how many tasks Dask would give it at once.
     """
@@ -48,14 +48,14 @@ class _Held:
 
 
 def greet(estimators: Sequence[str]) -> Greeting:
-    """Say what this process computes with; `estimators` are the names of those that will be asked for."""
+    """Return the versions of this process; `estimators` are the names of those that will be run."""
     from distributed import get_worker
 
     return replace(greeting(estimators), threads=get_worker().state.nthreads)
 
 
 def greeting(estimators: Sequence[str]) -> Greeting:
-    """Return what this process computes with, on a cluster or not."""
+    """Return the versions of this process, on a cluster or not."""
     from ...estimators.registry import package_of
     from ..results.identity import versions
     from ..results.store import provenance
@@ -71,7 +71,7 @@ def do(sweep: str, task: bytes) -> Finished:
     """
     from .pool import Worker
 
-    with _Held.lock:  # however many threads the worker has: runs at the same time would spoil each other's timings
+    with _Held.lock:  # one run at a time even with several threads, or timings would be wrong
         if _Held.worker is None or _Held.sweep != sweep:
             _let_go()
             _Held.worker, _Held.sweep = Worker(), sweep

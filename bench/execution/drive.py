@@ -1,4 +1,4 @@
-"""Drive one estimator through one log, time every step, and score what it said."""
+"""Drive one estimator through one log, and time every step."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Recorder:
 
         Raises:
             Diverged: it is not finite, is off this planet, or has no covariance although the first one had.
-            ValueError: it is for another time than the t_ns it was asked for.
+            ValueError: its time is not t_ns.
         """
         _check_time(belief, t_ns)
         k, state = len(self.belief_ns), belief.state

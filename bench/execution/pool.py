@@ -1,4 +1,4 @@
-"""Local workers: processes that do one task at a time, which task each is given, and what becomes of it."""
+"""Local worker processes: each does one task at a time, and is replaced when it dies or hangs."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from .child import Child, start
 from .task import Finished, Task
 
 GRACE_S = 120.0
-"""A worker that is this far past its run's timeout hangs inside one call, and is killed."""
+"""A worker this far past twice its run's timeout hangs inside one call and is killed, s; starting one takes seconds."""
 
 LogName: TypeAlias = tuple[str, int | None]
 """A log of one experiment: its name and seed."""
 
 
 class Queue:
-    """Tasks that wait, in order, except that those on one log go to one worker as long as the others have logs too."""
+    """Waiting tasks, in order; but a worker keeps to the log it has in memory, while there are logs for the others."""
 
     def __init__(self, tasks: Iterable[Task]) -> None:
         self._by_log: dict[LogName, deque[Task]] = {}
@@ -67,7 +67,7 @@ class Worker:
     give_up_s: float = float("inf")
 
     def begin(self, task: Task) -> None:
-        """Hand over a task; a worker that is already dead is found out by `wait`."""
+        """Hand over a task; `wait` notices if the worker is already dead."""
         self.task = self.last = task
         self.give_up_s = time.monotonic() + 2 * task.timeout_s + GRACE_S
         with suppress(OSError):

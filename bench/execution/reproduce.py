@@ -1,4 +1,4 @@
-"""Run again what a store holds, from the store alone, and compare bit for bit."""
+"""Repeat runs of a store from their specs alone, and compare the scores bit for bit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .task import Task
 
 COMPARED = ("status", "cause", "failed_at_s", "lookahead_s", "truth_kind", "duration_s", "start")
 COMPARED += (*SCORES, *FLOORS, *INNOVATIONS)
-"""What two runs of the same must have in common; and all within the JSON of PARTS. Times and memory are not there."""
+"""What must be equal when a run is repeated, besides the JSON of PARTS. Times and memory need not be."""
 PARTS = ("nees_at", "nis_dof", "counts")
 
 Value: TypeAlias = float | str | None
@@ -35,12 +35,12 @@ HashOf: TypeAlias = Callable[[str, Path | None, bool], str]
 
 
 class CannotRunError(Exception):
-    """A stored run cannot be made again here; says why."""
+    """A stored run cannot be repeated here; says why."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One score or fact that did not come out again."""
+    """One score or fact that differs."""
 
     name: str
     then: Value
@@ -63,14 +63,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class Again:
-    """A stored run, and what became of it when it was run again.
+    """A stored run and its repetition.
 
     Attributes:
         stored: as it was.
-        remarks: what of the spec, the log's description or the readings is not as it was, in sentences.
-        differences: by output, the largest first; no output at all where it was not run.
-        skipped: why it was not run.
-        time_ratio: computing time, now over then.
+        remarks: what has changed of the spec, the log's description or the readings, in sentences.
+        differences: by output, the largest first; empty where it was not repeated.
+        skipped: why it was not repeated.
+        time_ratio: computing time now over then.
     """
 
     stored: Stored
@@ -81,7 +81,7 @@ class Again:
 
     @property
     def is_identical(self) -> bool:
-        """Whether it was run, and every score of every output came out the same, bit for bit."""
+        """Whether it was repeated, and every score of every output is the same, bit for bit."""
         return self.skipped is None and not any(self.differences.values())
 
 
@@ -89,7 +89,7 @@ class Again:
 
 
 def rebuild(stored: Stored, data: Path | None, hash_of: HashOf) -> Task:
-    """Return the task that makes a stored run again, from its spec alone.
+    """Return the task that repeats a stored run, from its spec alone.
 
     Args:
         stored: a run of a store.
@@ -125,10 +125,10 @@ def rebuild(stored: Stored, data: Path | None, hash_of: HashOf) -> Task:
 
 
 def _remarks(stored: Stored, task: Task) -> Iterator[str]:
-    """Yield what is not as it was: of the spec, of the log's description, of its readings.
+    """Yield what has changed: of the spec, of the log's description, of its readings.
 
-    The spec and the versions being those of the row, an identity that is not can only come from the readings, or from
-    the package that brings the estimator.
+    If the identity differs while spec and versions are those of the row, then the readings have changed, or the package
+    that the estimator comes from.
     """
     then, now = _flat(stored.spec), _flat(json.loads(json.dumps(task.spec)))
     for key in dict.fromkeys([*then, *now]):
@@ -159,9 +159,9 @@ def _flat(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def reproduce_all(runs: Sequence[Stored], data: Path | str | None = None, jobs: int = 0) -> tuple[list[Again], bool]:
-    """Return what became of stored runs, and whether it is all of them; a progress bar stands on a terminal meanwhile.
+    """Repeat stored runs with a progress bar, and return how they compare, and whether all were repeated.
 
-    Interrupted (KeyboardInterrupt), it returns what is known so far.
+    Interrupted (KeyboardInterrupt), it returns those that are finished.
     """
     from rich.console import Console
     from rich.progress import track
@@ -178,9 +178,9 @@ def reproduce_all(runs: Sequence[Stored], data: Path | str | None = None, jobs: 
 
 
 def reproduce(runs: Sequence[Stored], data: Path | str | None = None, jobs: int = 0) -> Generator[Again]:
-    """Run stored runs again in worker processes, and yield what became of each; nothing is kept.
+    """Repeat stored runs in worker processes, and yield how each compares; nothing is stored.
 
-    First come those that cannot be run here, then the others, as they end.
+    First come those that cannot be repeated here, then the others, as they end.
 
     Args:
         runs: as `choose` returns them.
@@ -210,14 +210,14 @@ def _readings_sha256(log: str, data: Path | None, repair: bool) -> str:
 
 
 def _as_stored(row: Row) -> Record:
-    """Return a row as a store would give it back: NaN is nothing."""
+    """Return a row as a store returns it: NaN is None."""
     return {
         name: None if isinstance(row.get(name), float) and math.isnan(row[name]) else row.get(name) for name in COLUMNS
     }
 
 
 def compare(stored: Stored, done: Stored, remarks: tuple[str, ...] = ()) -> Again:
-    """Return how a run compares with the same run before."""
+    """Compare a repeated run with the stored one."""
     then, now = ({row["output"]: _outcome(row) for row in run.rows} for run in (stored, done))
     outputs = dict.fromkeys([*then, *now])
     differences = {output: _differences(then.get(output, {}), now.get(output, {})) for output in outputs}
@@ -232,9 +232,9 @@ def _differences(then: Mapping[str, Value], now: Mapping[str, Value]) -> tuple[D
 
 
 def _outcome(row: Record) -> dict[str, Value]:
-    """Return all of a row that its spec, readings, versions and kind of machine determine.
+    """Return the part of a row that spec, readings, versions and kind of machine determine.
 
-    A run that was out of time ended by the clock: no more than that it did can come out again.
+    A run that was out of time was ended by the clock, so only its status and cause can be equal.
     """
     if row["status"] not in FINAL and (row["cause"] or "").startswith("out of time"):
         return {name: row[name] for name in ("status", "cause")}
@@ -245,6 +245,6 @@ def _outcome(row: Record) -> dict[str, Value]:
 
 
 def changed_facts(stored: Stored) -> list[Difference]:
-    """Return what of commit, code, versions and machine is not today's."""
+    """Return which of commit, code, versions and machine differ from today's."""
     then, today = stored.made_by, facts(provenance())
     return [Difference(name, then.get(name), today[name]) for name in today if then.get(name) != today[name]]

@@ -1,4 +1,4 @@
-"""What a run of one estimator on one log gives, and what that says of cost and innovations."""
+"""The result of one estimator on one log, with its costs and innovations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Status: TypeAlias = Literal["done", "diverged", "failed"]
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What one estimator said about one log, and what that cost.
+    """Trajectories of one estimator on one log, and what they cost.
 
     Attributes:
         status: "done"; "diverged" where the estimator lost itself; "failed" for anything else that ended it early.

@@ -1,4 +1,4 @@
-"""A run on its way: what goes to a worker, wherever that is, and what comes back."""
+"""A task, which goes to a worker, and what comes back: rows and trajectories."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from ..results.store import Row, provenance
 
 @dataclass(frozen=True)
 class Task:
-    """One run and all a worker needs for it, as descriptions: a few kilobytes, however many runs there are.
+    """One run and all that a worker needs for it. It is a description of a few kilobytes, without arrays.
 
     Attributes:
         experiment: its name.
         run: which log, estimator and seed.
         scoring, max_gap_s, timeout_s: the experiment's, for this log.
-        spec: all that decides the run's numbers but readings and versions, see `Experiment.spec`.
+        spec: all that decides the run's numbers, except readings and versions; see `Experiment.spec`.
         lags_s: those of all estimators of the experiment, whose floors are found together.
         data: where recorded logs are.
         repair: let loaders drop bad rows.
@@ -65,7 +65,7 @@ class Task:
 
     @cached_property
     def identity(self) -> str:
-        """What tells this run from any other."""
+        """The identity of the run, see `identity.identity`."""
         return identity(self.spec, self.readings_sha256)
 
     def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
@@ -90,9 +90,9 @@ class Task:
 
 @dataclass(frozen=True)
 class Finished:
-    """What a run leaves: its rows, one per output, and its trajectories, by file name, as the bytes of a Parquet file.
+    """The result of a task: a row per output, and trajectories as the bytes of Parquet files, by name.
 
-    A worker writes no files, so it may be anywhere.
+    A worker writes no files, so it may run on another machine.
     """
 
     rows: list[Row]
@@ -101,7 +101,7 @@ class Finished:
     def keep(self, folder: Path) -> list[Row]:
         """Write the trajectories into trajectories/ of this folder, each whole or not at all, and return the rows.
 
-        A name stands for its content or its run, so a truth that is there already is left alone.
+        A name contains the identity of its content or its run, so a file that is there already is the same.
 
         Raises:
             ExperimentError: the disk is full, or the folder cannot be written.
@@ -135,7 +135,7 @@ def parquet(trajectory: Trajectory) -> bytes:
     import pyarrow as pa
     from pyarrow.parquet import write_table
 
-    columns = trajectory.to_columns()
+    columns: dict[str, Any] = {**trajectory.to_columns()}
     for i in range(15):
         for j in range(i, 15):
             values = columns.pop(f"P_{i}_{j}", None)

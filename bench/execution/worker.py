@@ -1,4 +1,4 @@
-"""In a worker: open a task's log, run its estimator, score what it said, and hand back rows and trajectories."""
+"""In a worker: open a task's log, run its estimator, score it, and return rows and trajectories."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from .result import Result, costs, innovation_dof, innovation_scores
 from .task import Finished, Task, file_name, parquet
 
 LOGS_KEPT = 2
-"""How many logs a worker keeps in memory, so that estimators share them."""
+"""How many logs a worker keeps in memory, so that estimators share them: the one it is at, and one taken over."""
 
 
 def work(connection: Connection) -> None:
-    """Do tasks until there are no more, or nobody to tell."""
+    """Do tasks until the connection closes."""
     cache = WorkerCache()
     while True:
         try:
@@ -145,7 +145,7 @@ class WorkerCache:
                 row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
             try:
                 row |= self.floor(task, result, trajectory.lookahead_s)
-            except ScoreError as error:  # a look-ahead that is none, say: the run is none the worse
+            except ScoreError as error:  # a look-ahead that is not defined, say: the other scores stand
                 row["notes"] = json.dumps([*log.notes, *result.notes, str(error)])
             if can_judge(log, scoring):
                 row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
@@ -154,7 +154,7 @@ class WorkerCache:
 
 
 def log_key(task: Task) -> str:
-    """Return what tells the task's log from any other."""
+    """Return a key that is equal for equal logs only."""
     return json.dumps([plain(task.run.log), task.run.seed, task.repair, str(task.data), task.readings_sha256])
 
 
@@ -179,7 +179,10 @@ def open_same(task: Task) -> Log:
 
 
 class _PeakMemory:
-    """Highest resident memory within the block above that at its start, MB; None where the system does not tell."""
+    """Peak of resident memory inside the block, less that at its start, MB; None where the system does not report it.
+
+    Memory that earlier runs left is given back before, or the peak would hide in it.
+    """
 
     def __enter__(self) -> _PeakMemory:
         self.peak_mb: float | None = None

@@ -1,8 +1,8 @@
-"""Which runs are done: the identity of a run, and who may write.
+"""The identity of a run: a hash of all that decides its numbers.
 
-A run is known by the hash of all that decides its numbers: its spec with every default, the readings of a recorded log,
-the code of this package, and the versions of what it computes with. So a run that is in the store under its identity
-need not be made again, and one whose spec or version has changed is another run.
+That is its spec with every default, the readings of a recorded log, the sources of this package, and the versions of
+what it computes with. A run that is in the store under its identity is not repeated; a changed spec or version makes
+another run.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ...estimators.registry import package_of
 
 COMPUTES_WITH = ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas")
 FINAL = ("done", "diverged")
-"""A run that ended so is not made again; one that failed (its worker died, its time was out) is."""
+"""Runs that ended so are not repeated; a failed one (its worker died, it was out of time) is."""
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Return what this process computes with: Python, packages, and the hash of our own code."""
+    """Return the versions of Python and packages, and the hash of our own sources."""
     found = {"python": python_version()}
     for package in COMPUTES_WITH:
         try:

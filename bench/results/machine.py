@@ -1,4 +1,4 @@
-"""Which machine this is, and what of it decides how floating-point numbers come out.
+"""The machine, and which of its properties decide how floating-point numbers are rounded.
 
 The same versions give the same bits where these facts are the same: the kind of processor, for which numba compiles and
 by which OpenBLAS, numpy and the C library choose among their kernels (fused or not, sums of four or of eight); and

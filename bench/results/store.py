@@ -1,4 +1,4 @@
-"""What runs leave behind: one SQLite file per experiment, one transaction per finished run."""
+"""The store of an experiment: one SQLite file, one transaction per finished run."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Store:
             run("CREATE UNIQUE INDEX IF NOT EXISTS one_row ON runs (experiment, log, label, ifnull(seed, -1), output)")
 
     def write(self, rows: Sequence[Row]) -> None:
-        """Put the rows of one run in place of what an earlier run of the same name left, all or nothing.
+        """Replace the rows of an earlier run of the same name by these, in one transaction.
 
         Raises:
             ExperimentError: the disk is full, or the file cannot be written.

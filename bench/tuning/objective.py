@@ -1,4 +1,4 @@
-"""What a search makes smaller: a score as it is, or how far an honest one is from what it ought to be."""
+"""The loss of a search: a score as it is, or the distance of a consistency score from its expected value."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from ...datasets.errors import nearest
 from ...datasets.state import Array
 from ..errors import ExperimentError
-from ..experiment.comparison import OVER_SEEDS
+from ..metrics.comparison import OVER_SEEDS
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
 from ..results.paired import FEWEST_SEEDS, TAKE, bootstrap_interval
@@ -25,13 +25,14 @@ DUE: dict[str, float] = (
     | {"nees_biases": 6.0, "nees_all": 15.0}
     | {f"within_{k}sigma_{of}": float(chi2.cdf(k**2, 1)) for k in (1, 2, 3) for of in ("position", "all")}
 )
-"""What scores of honesty are of an honest belief."""
+"""Expected values of consistency scores, for a consistent estimator."""
 
 SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(INNOVATIONS)
-"""What can be searched for: no cost, for noise does not change it, and no floor, for it is nobody's."""
+"""Scores that a search can minimise. Costs do not depend on the noise, and the floor not on the estimator."""
 
 
 BOOTSTRAP = {"confidence_level": 0.95, "n_resamples": 9999}
+"""Of every interval: scipy's own number of resamples."""
 
 
 class Marks(NamedTuple):
@@ -45,8 +46,8 @@ class Marks(NamedTuple):
 class Objective:
     """A score of one of an estimator's outputs, and the loss that it is made into.
 
-    The loss of a score of honesty is |ln(score / what is due)|, twice too large being as bad as twice too small; of any
-    other it is the score. Over runs it is taken as tables take it: squared errors are pooled before the root.
+    The loss of a consistency score is |ln(score / expected value)|, so that twice too large is as bad as half. The loss
+    of any other score is the score itself. Runs are combined as in tables: squared errors are pooled before the root.
 
     Raises:
         ExperimentError: no such score, or not of this output.
@@ -60,16 +61,16 @@ class Objective:
             known = ", ".join(SCORES)
             raise ExperimentError(f"--score: no score {self.score!r}{nearest(self.score, SCORES)} (known: {known})")
         if self.needs_nis and self.output != "online":
-            raise ExperimentError(f"--score {self.score}: innovations are of what was said online")
+            raise ExperimentError(f"--score {self.score}: only the online output has innovations")
 
     @property
     def needs_nis(self) -> bool:
-        """Whether runs must be judged by their innovations."""
+        """Whether the score needs NIS."""
         return self.score in INNOVATIONS
 
     @property
     def is_distance(self) -> bool:
-        """Whether the loss is a distance from what is due, 0 at best."""
+        """Whether the loss is a distance from the expected value, 0 at best."""
         return self.score in DUE
 
     def lacking(self, row: Mapping[str, Any]) -> str | None:

@@ -1,4 +1,4 @@
-"""What a search has found: the data sheet beside the best, on what trained and on what was held out; and a figure."""
+"""The outcome of a search: data sheet and best trial, on training and held-out runs; printed, written and drawn."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FLAT = 3.0
 SIDES = ("training", "held out")
 
 EDGE = 1.1
-"""A best factor this near to an end of its range may lie beyond it."""
+"""A best factor within 10 % of an end of its range may lie beyond it."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Search an estimator's noise factors on training runs, and look once at what was held out.
+"""Search an estimator's noise factors on training runs, then score them once on held-out runs.
 
-The search is a tree-structured Parzen estimator (optuna). Trial 0 is the data sheet, every factor 1. Each trial is a
-set of ordinary runs in worker processes; whatever is finished is in the store at once, so the same command goes on
-where it was stopped, and ends as if it had not been.
+The search is a tree-structured Parzen estimator (optuna). Trial 0 is the data sheet: every factor is 1. Each trial is a
+set of ordinary runs in worker processes. Finished runs are in the store at once, so the same command resumes a search
+that was stopped, and its trials are the same as without the stop.
 
 Source: Bergstra, Bardenet, Bengio & Kégl 2011, Algorithms for Hyper-Parameter Optimization, NeurIPS 24.
 """
@@ -24,11 +24,12 @@ from .split import in_words
 from .tuning import Tuning
 
 BATCH = 10
-"""Trials asked for before any of them is run. It does not depend on how many workers there are, so trials do not."""
+"""How many trials are chosen before any of them is run. It does not depend on the number of workers, so neither do
+the trials."""
 
 
 class Trial(NamedTuple):
-    """One point of the search; loss is None where a run did not come to its end, or had no score, and why."""
+    """One point of the search; loss is None where a run failed or has no score, and cause says why."""
 
     number: int
     factors: dict[str, float]
@@ -37,7 +38,7 @@ class Trial(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """How far a search is: trials whose runs have ended, of how many, and the best of them."""
+    """Progress of a search: finished trials, of how many, and the best of them."""
 
     known: int
     trials: int
@@ -109,8 +110,8 @@ class Search:
     def _ask(self, trials: int) -> dict[int, dict[str, float]]:
         """Return the trials that wait for runs, by number; asks for the next batch where none does.
 
-        A batch is asked for before any of it is known, and each trial's sampler has a seed of its own: so a search that
-        was stopped anywhere asks for what it would have asked for, on however many workers.
+        All trials of a batch are chosen before any result is known, and each trial's sampler has a seed of its own. So
+        the trials depend neither on the number of workers nor on interruptions.
         """
         from optuna import create_study
         from optuna.distributions import FloatDistribution
@@ -125,7 +126,7 @@ class Search:
             end = last + BATCH if all(number in self._waiting for number in range(last, asked)) else asked
         factor = FloatDistribution(self.tuning.low, self.tuning.high, log=True)
         space: dict[str, Any] = dict.fromkeys(self.tuning.dials, factor)
-        shadow = create_study()  # which may be asked for nothing by halves: the study gets whole trials
+        shadow = create_study()  # a copy to sample from, so that the study holds complete trials only
         shadow.add_trials(self._study.trials)
         if not asked:
             shadow.enqueue_trial(dict.fromkeys(self.tuning.dials, 1.0))
@@ -138,7 +139,7 @@ class Search:
         return dict(self._waiting)
 
     def _runs(self, trials: Mapping[int, dict[str, float]], runs: Sequence[Run], jobs: int) -> Iterator[None]:
-        """Make the runs of these trials that are missing, log by log, and put each into the store as it ends."""
+        """Run what is missing of these trials, log by log, and store each run as it ends."""
         tasks = [
             self.tuning.task(number, factors, run, self._study.study_name)
             for run in runs
@@ -146,13 +147,13 @@ class Search:
             if not any(row["status"] in FINAL for row in self._rows.get(self._key(number, run), []))
         ]
         for finished in run_all(tasks, jobs):
-            kept = [{**row, "trajectory": None, "truth_trajectory": None} for row in finished.rows]  # nobody looks
+            kept = [{**row, "trajectory": None, "truth_trajectory": None} for row in finished.rows]
             self._store.write(kept)
             self._keep(kept)
             yield
 
     def _tell(self) -> None:
-        """Tell the study of every trial whose last run has ended; one that went wrong is worse than all others."""
+        """Report every finished trial to the study; one with a failed run is reported as worse than all others."""
         from optuna.trial import TrialState
 
         train = self.tuning.split.train

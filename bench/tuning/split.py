@@ -1,4 +1,4 @@
-"""Which runs a search may look at, and which are held out from it."""
+"""Which runs train a search, and which are held out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAME_THEM = 'name them: `tune: {train: [...], held_out: [...]}`, or --train and 
 
 
 class Split(NamedTuple):
-    """The runs of one estimator: what the search sees, what it never sees, and the logs that take no part."""
+    """The runs of one estimator: training, held out, and the names of logs that are neither."""
 
     train: list[Run]
     held_out: list[Run]
@@ -70,7 +70,7 @@ def _matches(run: Run, pattern: str) -> bool:
 
 
 def _refuse_both(train: Sequence[Run], held_out: Sequence[Run]) -> None:
-    """Refuse what would let the search see what is held out: one recording twice, or the same random numbers."""
+    """Refuse a recording, or a seed, that is on both sides: the search would see what is held out."""
     for ours in train:
         for theirs in held_out:
             if _source(ours) == _source(theirs):

@@ -1,4 +1,4 @@
-"""What `fathom tune` searches: which factors on an estimator's noise, on which runs, for which score."""
+"""The problem that `fathom tune` solves: factors on an estimator's noise, training runs, and a score."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Tuning:
 
     @property
     def identity(self) -> str:
-        """What tells this study from any other: all that decides a trial's loss, and where the next is looked for."""
+        """Hash of all that decides the losses and the sequence of trials."""
         sheet = [self.task(0, {}, run).identity for run in self.split.train]
         decides = [sheet, self.dials, self.objective.score, self.objective.output, self.low, self.high, self.seed]
         return sha256(json.dumps(decides).encode()).hexdigest()[:12]
@@ -86,7 +86,7 @@ def prepare(
     data: Path | None = None,
     repair: bool = False,
 ) -> Tuning:
-    """Check all that can be checked before a search, and open the recorded logs that train; no other.
+    """Check a search before it begins. Of the recorded logs only those that train are opened.
 
     Args:
         estimator: its label; may be left out where there is only one that can be tuned.
@@ -139,12 +139,12 @@ def _chosen(experiment: Experiment, label: str | None) -> EstimatorSpec:
 
 
 def _can_score(log: Log, run: Run, experiment: Experiment, objective: Objective) -> None:
-    """Refuse a recorded log that will never have the score."""
+    """Refuse a recorded log that cannot have the score."""
     if objective.needs_nis:
         return
     if log.truth is None:
         raise ExperimentError(
-            f"{run.log.name}: no truth, so no {objective.score}; --score nis_dvl and the like need none"
+            f"{run.log.name}: no truth, so no {objective.score}; --score nis_dvl and the like need no truth"
         )
     if objective.is_distance and not can_judge(log, experiment.scoring(run.log)):
         why = f"its truth is a {log.truth_kind}" if log.truth_kind != "truth" else "it is scored aligned"
@@ -154,7 +154,7 @@ def _can_score(log: Log, run: Run, experiment: Experiment, objective: Objective)
 
 
 def _is_there(run: Run, data: Path | None) -> None:
-    """Refuse a recording that is not here before anything runs, and without opening it."""
+    """Refuse a held-out recording that is missing, without opening it."""
     root = data or os.environ.get("FATHOM_DATA")
     if run.log.log is not None and not any((Path(place) / run.log.log).exists() for place in ("", root or "")):
         raise RecordingNotFound(f"{run.log.log}: held out, but neither here nor in {root}; use --data or FATHOM_DATA")

@@ -1,7 +1,7 @@
-"""Faults: what goes wrong with a sensor and no estimator is told of.
+"""Faults of simulated sensors, of which no estimator is told.
 
-Each is a dial that is off by default, and draws from a random stream of its own. A fault belongs to the log alone: the
-rig says what was meant, the log what happened. Faults keep their size when a scenario scales its noise.
+Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig. They keep
+their size when a scenario scales its noise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..state import Array, TimeArray
 from .random_streams import random_stream
 
 LONGEST_CLOCK_OFFSET_S = 5.0
-"""Well inside the margin that a mission's splines have beyond both its ends."""
+"""Largest clock offset, s: well inside the margin of a mission's splines beyond both its ends."""
 
 
 def _in_order(interval: tuple[float, float]) -> tuple[float, float]:
@@ -34,7 +34,7 @@ ClockOffset = Annotated[float, Field(ge=-LONGEST_CLOCK_OFFSET_S, le=LONGEST_CLOC
 
 
 class Marring(NamedTuple):
-    """What befalls the values of one sensor, in the unit of its readings; each figure a number, or one per column."""
+    """Outlier sigma, saturation limit and quantisation step, in the unit of a sensor's readings; one, or per column."""
 
     outlier: float | Array
     limit: float | Array = np.inf
@@ -43,14 +43,14 @@ class Marring(NamedTuple):
 
 @dataclass(frozen=True, config=STRICT)
 class Faults:
-    """What can befall any sensor.
+    """Faults that any sensor can have.
 
     Attributes:
-        dropout_probability: of each reading, to get lost.
+        dropout_probability: of each reading, to be lost.
         outages_s: [from, to] pairs, s from the log's start: no reading is stamped inside.
         outlier_probability: of each reading, to carry a gross error: normal, zero-mean, with the standard deviation of
             the sensor's own `outlier` dial on every axis (a contaminated normal distribution).
-        repeat_probability: of each reading, to say again what the one before it said, at its own time.
+        repeat_probability: of each reading, to repeat the values of the one before it, at its own time.
         clock_offset_s: readings are stamped this much later than they were true; reception is by the right clock, but
             never before the stamp.
     """

@@ -1,4 +1,4 @@
-"""What a simulated log says of its own making: a sentence for every dial that is not at its default."""
+"""The notes of a simulated log: a sentence for every setting that differs from its default."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ TOLD = {
     *("min_range_m", "max_range_m", "max_tilt_deg", "beam_loss_probability", "three_beams"),
     *("reacquisition_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg"),
 }
-"""Dials of sensors that neither the rig nor the readings show."""
+"""Settings of sensors that neither the rig nor the readings show."""
 
 
 def told(scenario: Scenario) -> list[str]:
-    """Return a sentence on the world, on each sensor's dials, delays and faults, where there is anything to say."""
+    """Return sentences on the world, and on each sensor's settings, delays and faults, where there are any."""
     return [*_world(scenario), *_biases(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
 
 

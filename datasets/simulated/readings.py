@@ -24,9 +24,9 @@ from .specs import DepthSpec, GpsSpec, HeadingSpec, SensorSpec
 Kind = TypeVar("Kind", bound=ReadingStream)
 
 ANTENNA_AWASH_M = -0.05
-"""The antenna hears GPS while it is higher than this; a little water over it does not yet drown the signal."""
+"""GPS is received while the antenna is higher than this over the water, m: centimetres of water let it pass."""
 WATCH_S = 0.1
-"""How often a receiver that must reacquire looks whether its antenna is awash."""
+"""Step at which submersions of the antenna are sampled, s; a tenth of GPS's usual period."""
 
 
 def ticks(rate_hz: float, duration_s: float) -> TimeArray:

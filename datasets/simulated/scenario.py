@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
@@ -56,6 +57,12 @@ def _of_this_noise(imu: Any) -> Any:
     return {"noise": imu} if isinstance(imu, str | ImuNoise) else imu
 
 
+if TYPE_CHECKING:
+    Imu = Any  # an ImuSpec, which may be made from its noise alone
+else:
+    Imu = Annotated[ImuSpec, BeforeValidator(_of_this_noise)]
+
+
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """A mission, a vehicle and its sensors.
@@ -67,7 +74,7 @@ class Scenario:
 
     mission: str = "lawnmower"  # a name in MISSIONS, or "recorded"
     duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
-    imu: Annotated[ImuSpec, BeforeValidator(_of_this_noise)] = ImuSpec()  # or its noise alone: "tactical"
+    imu: Imu = ImuSpec()  # or its noise alone: "tactical"
 
     # the path
     speed_m_s: Positive = 1.5
@@ -180,7 +187,7 @@ class Scenario:
         """Angular rate of the Earth, (3,) in W axes; zero where it does not turn."""
         return np.zeros(3) if self.latitude_deg is None else self.rig.w_CW_W
 
-    @property
+    @cached_property
     def rig(self) -> Rig:
         """What the estimators are told of the vehicle."""
         aboard = {sensor: getattr(self, sensor) for sensor in ("depth", "gps", "heading")}
@@ -192,7 +199,7 @@ class Scenario:
             latitude_deg=self.latitude_deg,
         )
 
-    @property
+    @cached_property
     def mountings(self) -> dict[str, Mounting]:
         """Where the IMU and the sensors aboard really sit, by sensor name: the rig's word and their faults."""
         rig = self.rig

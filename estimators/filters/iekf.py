@@ -1,5 +1,7 @@
 """The right-invariant extended Kalman filter with biases ("imperfect": biases stand beside the group).
 
+The equations are docs/conventions.md (39) to (43).
+
 Pose and velocity X = (R_WB, v_WB_W, p_WB_W) are one element of SE_2(3), and the error is on its left, in W:
 
     X_true = Exp(xi) X        xi = (phi, rho, nu), rotation, position, velocity; biases are added, as ever
@@ -43,6 +45,7 @@ from ..physics.imu import integrate, predict, process_noise, sandwich, turns
 from ..physics.measurements import measure
 from ..physics.so3 import cross_into, exp, product, right_jacobian, skew_into, transform, transform_into
 from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
+from ..stages import stage
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 PHI, RHO, NU = THETA, POSITION, VELOCITY
@@ -78,6 +81,7 @@ class InvariantKalman(Kalman):
         """See `Kalman.correct`."""
         return correct_invariant(state, rig, readings, self._origin)
 
+    @stage("marginal")
     def error_covariance(self, state: NDArray[Any]) -> Array:
         """See `Kalman.error_covariance`. (The rate noise that a belief adds to v is the same in nu.)"""
         s = state[0]
@@ -120,19 +124,19 @@ def propagate_invariant(
 ) -> None:
     """x ← f(x, imu), P ← Φ P Φᵀ + A Q Aᵀ, with A = `to_invariant` at the end."""
     s, F, Q, none = state[0], np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.zeros((DIM, DIM))
-    back = from_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
-    integrate(imu, before, s.b_a, s.b_g, rig, block)
-    process_noise(block, s.R_WB, Q)
+    back = from_invariant(s.R_WB[:], s.p_WB_W - origin, s.v_WB_W[:])
+    integrate(imu, before, s.b_a[:], s.b_g[:], rig, block)
+    process_noise(block, s.R_WB[:], Q)
     predict(block, state, rig[0].gravity, F, state)
-    A = to_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
-    if turns(block[0].w_CW_W):
+    A = to_invariant(s.R_WB[:], s.p_WB_W - origin, s.v_WB_W[:])
+    if turns(block[0].w_CW_W[:]):
         Phi, AF = np.zeros((DIM, DIM)), np.zeros((DIM, DIM))
         add_product(A, F, AF)
         add_product(AF, back, Phi)
     else:
         Phi = invariant_transition(block, rig[0].gravity, F, A)
     sandwich(A, Q, none, Q)
-    sandwich(Phi, s.P, Q, s.P)
+    sandwich(Phi, s.P[:], Q, s.P[:])
 
 
 @inner
@@ -177,19 +181,19 @@ def correct_invariant(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[
     H by the invariant error is H · `from_invariant`: for a DVL (0, 0, R_BW).
     """
     s, dx, r, H, C = state[0], np.zeros(DIM), np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
-    by_phi, p_OB_W, v_WB_W = np.empty((3, 3)), s.p_WB_W - origin, s.v_WB_W
+    by_phi, p_OB_W, v_WB_W = np.empty((3, 3)), s.p_WB_W - origin, s.v_WB_W[:]
     for m in range(len(readings)):
         n = measure(readings, m, state, rig, r, H, C)
         for row in range(n):
-            transform_into(s.R_WB, H[row, THETA], by_phi[0])
+            transform_into(s.R_WB[:], H[row, THETA], by_phi[0])
             cross_into(p_OB_W, H[row, POSITION], by_phi[1])
             cross_into(v_WB_W, H[row, VELOCITY], by_phi[2])
             for i in range(3):
                 H[row, PHI_0 + i] = by_phi[0, i] + by_phi[1, i] + by_phi[2, i]
-        if not absorb(n, r, H, C, dx, s.P):
+        if not absorb(n, r, H, C, dx, s.P[:]):
             return False
     inject_invariant(state, dx, origin)
-    symmetrise(s.P)
+    symmetrise(s.P[:])
     return np.isfinite(dx.sum())
 
 
@@ -198,7 +202,7 @@ def inject_invariant(state: NDArray[Any], dx: Array, origin: Array) -> None:
     """X ← Exp(xi) X: R ← Exp(phi) R, v ← Exp(phi) v + J_l(phi) nu, p likewise about the origin."""
     s = state[0]
     turn, J_l = exp(dx[PHI]), right_jacobian(-dx[PHI])
-    R_WB, p, v = product(turn, s.R_WB), transform(turn, s.p_WB_W - origin), transform(turn, s.v_WB_W)
+    R_WB, p, v = product(turn, s.R_WB[:]), transform(turn, s.p_WB_W - origin), transform(turn, s.v_WB_W[:])
     moved, gained = transform(J_l, dx[RHO]), transform(J_l, dx[NU])
     for i in range(3):
         for j in range(3):

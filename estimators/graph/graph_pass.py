@@ -7,6 +7,7 @@ of each state what it believes when that state leaves the window.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,13 +20,11 @@ from ...datasets.epochs import DVL, IMU_SAMPLE, SENSOR, Epoch
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Belief, NavState
 from ...datasets.trajectory import Trajectory
+from ..between_keyframes import carry_on
 from ..interface import Diverged
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, SOLVE, SUMMED, Keyframes
 from ..physics.dvl_preintegration import preintegrate_dvl
-from ..physics.elimination import normalised_square
 from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict, split
-from ..physics.kalman import carry, correct, propagate
-from ..physics.measurements import measure
 from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import Loss, width
 from ..smoothers import GraphSmoother
@@ -40,7 +39,7 @@ from .gtsam_border import (
     reading_factor,
     tight_displacement_factor,
 )
-from .losses import distance, m_estimator, rows, with_loss
+from .losses import distance, rows, with_loss
 from .solvers import Solver
 
 
@@ -130,7 +129,7 @@ class GraphPass:
             self._flush()
             if self._belief is None:
                 self._belief = self._solver.belief(newest.index, newest.t_ns)
-        return with_rate_noise(self._filter_on(newest, self._belief), self._rig)
+        return self._carried_on(newest, self._belief, self._now_ns, self._keyframes.not_given_out())
 
     def finish(self) -> Trajectory | None:
         """See `Pass.finish`. States still in the window have seen less than the lag: all that there was."""
@@ -254,45 +253,16 @@ class GraphPass:
         predict(block, record, self._rig[0]["gravity"], F, end)
         return as_belief(t_ns, end).state
 
-    @stage("propagation")
-    def _carry(self, keyframe: Keyframe, belief: Belief, t_ns: int) -> Belief:
-        """Return a belief at a keyframe, carried to t_ns."""
-        if t_ns == keyframe.t_ns:
-            return belief
-        record, block = self._block(keyframe, belief.state, t_ns)
-        record["P"] = belief.P
-        carry(block, record, self._rig[0]["gravity"])
-        return as_belief(t_ns, record)
-
-    @stage("propagation")
-    def _filter_on(self, keyframe: Keyframe, belief: Belief) -> Belief:
-        """Return the belief at the newest keyframe, carried to now and corrected by the readings since."""
-        waiting = self._keyframes.not_given_out()
-        if self._now_ns == keyframe.t_ns and not waiting:
-            return belief
-        assert keyframe.before is not None
-        state, block = as_record(belief), np.zeros(1, BLOCK)
-        rest, before = keyframe.imu, keyframe.before
-        for reading in [*waiting, None]:
-            t_ns = self._now_ns if reading is None else max(int(reading["t_ns"][0]), keyframe.t_ns)
-            part, rest = split(rest, t_ns)
-            if len(part):
-                propagate(state, self._rig, before, part, block)
-                before = part[-1:]
-            if reading is not None and not correct(state, self._rig, self._weighted(reading, state)):
-                raise Diverged("the innovation covariance is not positive, or the state is not finite")
-        return as_belief(self._now_ns, state)
-
-    def _weighted(self, reading: NDArray[Any], state: NDArray[Any]) -> NDArray[Any]:
-        """Return a reading of the noise that its loss leaves it with at a predicted state (a STATE record)."""
-        loss = self._losses[int(reading["kind"][0])]
-        r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
-        if loss is None or not (n := measure(reading, 0, state, self._rig, r, H, C)):
-            return reading
-        weight = m_estimator(loss, n).weight(np.sqrt(normalised_square(n, r, H, C)))
-        reading = reading.copy()
-        reading["sigma"] = reading["sigma"] / np.sqrt(weight) if weight > 0 else np.inf
-        return reading
+    def _carried_on(
+        self, keyframe: Keyframe, belief: Belief, t_ns: int, waiting: Sequence[NDArray[Any]] = ()
+    ) -> Belief:
+        """Return a belief at a keyframe, carried on to t_ns and corrected by the readings that wait."""
+        if t_ns != keyframe.t_ns or waiting:
+            assert keyframe.before is not None
+            state = as_record(belief)
+            carry_on(state, self._rig, keyframe.before, keyframe.imu, t_ns, waiting, self._config.robust)
+            belief = as_belief(t_ns, state)
+        return with_rate_noise(belief, self._rig)
 
     # --- smoothed states --------------------------------------------------------------------------------------------
 
@@ -314,7 +284,7 @@ class GraphPass:
                     belief = self._solver.belief(keyframe.index, keyframe.t_ns)
                 else:
                     belief = Belief(keyframe.t_ns, self._solver.state(keyframe.index), np.full((15, 15), np.nan))
-                self._smoothed.append(with_rate_noise(self._carry(keyframe, belief, t_ns), self._rig))
+                self._smoothed.append(self._carried_on(keyframe, belief, t_ns))
 
     def _count_outliers(self, keyframe: Keyframe, values: gtsam.Values) -> None:
         """Count the factors on a keyframe that end beyond the width of their loss."""

@@ -1,7 +1,7 @@
 """The border with GTSAM: keys, tangents, and our physics as its factors.
 
 GTSAM's pose tangent is (rotation, translation in B) and its bias stands in B axes, since it is fed with samples in B.
-Everything is converted here and nowhere else.
+Everything is converted here and nowhere else; docs/conventions.md (46) to (48).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
-from ..interface import Diverged
+from ..interface import Diverged, unknown_kind
 from ..physics.dvl_preintegration import given_rotation
 from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
@@ -30,6 +30,7 @@ from ..stages import stage
 
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
+"""For factors that do not depend on velocity or bias."""
 LEAST_WALK = 1e-4
 """1/s: a bias must walk for GTSAM; by this much of the white noise nobody notices."""
 INTEGRATION_DENSITY = 1e-5
@@ -191,7 +192,7 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
     """
     row, g = reading[0], rig[0]
     if not 0 <= row["kind"] < len(SENSOR):
-        raise ValueError(f"a reading of unknown kind {row['kind']}; the kinds are 0 to {len(SENSOR) - 1}")
+        raise unknown_kind(row["kind"])
     sigma = row["sigma"] * g["inflate"][row["kind"]]
     if row["kind"] == DEPTH:
         model = gtsam.noiseModel.Diagonal.Sigmas(np.array([np.inf, np.inf, sigma[0]]))
@@ -262,7 +263,7 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
 
 @stage("linearisation")
 def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.CustomFactor:
-    """Return the loose preintegrated-DVL factor (eq. 6) between two keyframes."""
+    """Return the loose preintegrated-DVL factor between two keyframes; docs/conventions.md (6)."""
 
     @stage("linearisation")
     def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:

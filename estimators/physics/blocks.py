@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ...datasets.state import Array
 from .compiled import compiled
+
+TOP = np.int64(0)
+"""The first row; a plain 0 would be a type of its own, and the function compiled once more."""
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Innovations: what a reading says against the belief from before it, and whether that belief owned up to it (NIS)."""
+"""Innovations: a reading against the belief before it, and their normalised square, NIS; docs/conventions.md (37)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table:
     for m in range(len(readings)):
         n, largest = measure(readings, m, state, rig, r, H, S), 0.0
         for i in range(n):
-            S[i, i] = project(H[i], state[0].P, S[i, i], PH)
+            S[i, i] = project(H[i], state[0].P[:], S[i, i], PH)
             for j in range(DIM):
                 largest = max(largest, abs(H[i, j]))
                 for k in range(i):

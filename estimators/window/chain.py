@@ -1,19 +1,15 @@
-"""Gauss–Newton's normal equations on a chain of keyframes, in which each is tied to its neighbours only.
+"""Gauss–Newton's normal equations on a chain of keyframes, each tied to its neighbours; docs/conventions.md (45).
 
-They are block-tridiagonal, 15 × 15, and are eliminated from the oldest keyframe to the newest. In the information form
-that is a block Cholesky; but a tactical IMU knows the motion of 0.2 s to 0.1 mm, a prior the place to metres, and the
-eight digits between them (squared: all sixteen) are lost where one is taken from the other. So each step is written in
-the covariance form, in which the strong tie is a small addend and nothing cancels:
+docs/window.md derives them; equation numbers are those of that page. They are block-tridiagonal, 15 × 15, and are
+eliminated in the covariance form, in which nothing cancels:
 
     δ_j = F δ_i + c + noise of covariance Q                                   a tie from keyframe i to the next, j
     N(m, P)              of δ_i, given all that is older and i's own rows
     N(m_given, P_given)  of δ_j, given the same and the rows of both
-    G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back-substitution
+    G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back substitution
 
-It is the elimination that Rauch, Tung & Striebel (doi:10.2514/3.3166) wrote down first. What a state that has left knew
-is then (m_given, P_given) of the next one: marginalising costs nothing. A row is r + H δ (+ H_j δ_j), of unit variance.
-
-Inner loops run along rows of fixed length, so that they compile to vector instructions.
+A row is r + H δ (+ H_j δ_j), of some variance. Inner loops run along rows of fixed length, so that they compile to
+vector instructions.
 """
 
 from __future__ import annotations
@@ -21,10 +17,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.state import DIM, Array
+from ..physics.blocks import clear
+from ..physics.compiled import compiled, inner
 from ..physics.elimination import add_scaled
 from ..physics.state import symmetrise
 
@@ -36,14 +33,12 @@ NODE = np.dtype(
         ("m_given", "f8", (DIM,)),  # what all that is older says of it
         ("d", "f8", (DIM,)),  # with all there is: the increment
         ("t_ns", "i8"),
-        ("next_ns", "i8"),  # of the next keyframe; 0 where there is none
-        ("imu_from", "i8"),  # samples since, and where they end
-        ("imu_to", "i8"),
+        ("imu_from", "i8"),  # first of the samples since
         ("first", "i8"),  # of its factors; -1 for none
-        ("dvl", "i8"),  # first of the DVL readings kept for its interval; -1 for none
         ("moved", "i8"),  # linearised anew in this update
         ("P", "f8", (DIM, DIM)),  # as m
         ("P_given", "f8", (DIM, DIM)),  # as m_given
+        ("P_smoothed", "f8", (DIM, DIM)),  # as d, where `smooth_covariances` has been
         ("F", "f8", (DIM, DIM)),  # the tie to the next keyframe
         ("Q", "f8", (DIM, DIM)),
         ("c", "f8", (DIM,)),
@@ -52,13 +47,14 @@ NODE = np.dtype(
 """Nodes lie in a ring whose length is a power of two: keyframe k in slot k & (length − 1)."""
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def absorb_joint_row(
     r: float, h_i: Array, h_j: Array, variance: float,
     m_i: Array, P_i: Array, m_j: Array, P_j: Array, P_ji: Array,
 ) -> bool:  # fmt: skip
-    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji being cov(δ_j, δ_i)."""
-    PH_i, PH_j = np.zeros(DIM), np.zeros(DIM)
+    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji = cov(δ_j, δ_i); eq. (5) for a row (3)."""
+    PH = np.zeros((2, DIM))
+    PH_i, PH_j = PH[0], PH[1]
     for k in range(DIM):
         add_scaled(PH_i, h_i[k], P_i[k])
         add_scaled(PH_i, h_j[k], P_ji[k])
@@ -80,11 +76,11 @@ def absorb_joint_row(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j: Array, P_ji: Array) -> None:
-    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P and P_j = F P Fᵀ + Q."""
+    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P, P_j = F P Fᵀ + Q; eq. (6)."""
     P_ij = np.empty((DIM, DIM))
-    P_ji[:] = 0.0
+    clear(P_ji)
     for a in range(DIM):
         m_j[a] = c[a]
         for k in range(DIM):
@@ -94,18 +90,21 @@ def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j:
         for k in range(DIM):
             P_ij[k, a] = P_ji[a, k]
     for a in range(DIM):
-        P_j[a] = Q[a]
+        for b in range(DIM):
+            P_j[a, b] = Q[a, b]
         for k in range(DIM):
             if F[a, k] != 0.0:
                 add_scaled(P_j[a], F[a, k], P_ij[k])
     symmetrise(P_j)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
-    """Fill the increments d of keyframes low to newest."""
+    """Fill the increments d of keyframes low to newest; eq. (8)."""
     mask, x = len(nodes) - 1, np.empty(DIM)
-    nodes[newest & mask].d[:] = nodes[newest & mask].m
+    last = nodes[newest & mask]
+    for i in range(DIM):
+        last.d[i] = last.m[i]
     for k in range(newest - 1, low - 1, -1):
         n, ahead = nodes[k & mask], nodes[(k + 1) & mask]
         Gt, m, d, d_j, m_j = n.Gt, n.m, n.d, ahead.d, ahead.m_given
@@ -122,27 +121,28 @@ def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
             d[i], d[i + 1], d[i + 2], d[i + 3], d[i + 4] = d_0, d_1, d_2, d_3, d_4
 
 
-@njit(cache=True, error_model="numpy")
-def step_back(node: NDArray[Any], ahead: NDArray[Any], P: Array) -> None:
-    """Turn P, the covariance with hindsight of the next keyframe, into that of this one; both NODEs of length 1."""
-    Gt, P_given, own = node[0].Gt, ahead[0].P_given, node[0].P
-    gained = np.zeros((DIM, DIM))
-    for a in range(DIM):
-        for b in range(DIM):
-            add_scaled(gained[a], P[a, b] - P_given[a, b], Gt[b])
-    P[:] = own
-    for i in range(DIM):
+@compiled
+def smooth_covariances(nodes: NDArray[Any], low: int, newest: int) -> None:
+    """Fill P_smoothed, the covariance of δ given all there is, of keyframes newest down to low; eq. (9)."""
+    mask, gained = len(nodes) - 1, np.empty((DIM, DIM))
+    copy_into(nodes[newest & mask].P, nodes[newest & mask].P_smoothed)
+    for k in range(newest - 1, low - 1, -1):
+        node, ahead = nodes[k & mask], nodes[(k + 1) & mask]
+        Gt, P, P_ahead, P_given = node.Gt, node.P_smoothed, ahead.P_smoothed, ahead.P_given
+        clear(gained)
         for a in range(DIM):
-            add_scaled(P[i], Gt[a, i], gained[a])
-    symmetrise(P)
+            for b in range(DIM):
+                add_scaled(gained[a], P_ahead[a, b] - P_given[a, b], Gt[b])
+        copy_into(node.P, P)
+        for i in range(DIM):
+            for a in range(DIM):
+                add_scaled(P[i], Gt[a, i], gained[a])
+        symmetrise(P)
 
 
-@njit(cache=True, error_model="numpy")
-def covariance_with_hindsight(nodes: NDArray[Any], k: int, newest: int) -> Array:
-    """Return the covariance (15, 15) of δ_k, given all there is; it costs a step for every keyframe since k."""
-    mask = len(nodes) - 1
-    P = nodes[newest & mask].P.copy()
-    for i in range(newest - 1, k - 1, -1):
-        a, b = i & mask, (i + 1) & mask
-        step_back(nodes[a : a + 1], nodes[b : b + 1], P)
-    return P
+@inner
+def copy_into(A: Array, out: Array) -> None:
+    """out ← A, both (15, 15)."""
+    for i in range(DIM):
+        for j in range(DIM):
+            out[i, j] = A[i, j]

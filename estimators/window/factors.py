@@ -1,6 +1,7 @@
 """The factors of the window: readings, displacements and IMU blocks, linearised into rows and ties of its chain.
 
-The physics is that of `measurements` and `imu`; here it is whitened, weighted by its loss, and kept.
+The physics is that of `physics`; here it is whitened, weighted by its loss, and kept. Equation numbers are those of
+docs/window.md.
 """
 
 from __future__ import annotations
@@ -9,18 +10,20 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from ...datasets.state import DIM, POSITION, THETA, VELOCITY, Array
+from ...datasets.state import DIM, THETA, Array
+from ..physics.blocks import clear
+from ..physics.compiled import compiled, inner
 from ..physics.imu import predict, process_noise
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
-from ..physics.so3 import exp, product, right_jacobian, skew, transform_into
-from ..physics.state import STATE, local, turn_covariance, turn_rows
+from ..physics.so3 import exp_into, product_into, right_jacobian_into, skew_into, transform_into
+from ..physics.state import POSITION_0, STATE, VELOCITY_0, local, turn_covariance, turn_rows
+from ..robust import weight_of
+from .chain import copy_into
 
 AT_KEYFRAME, CARRIED, LOOSE, TIGHT = range(4)
 """What a factor is: a reading that was true at its keyframe, one that the IMU carries there, and displacements."""
-LOSSES = ("", "huber", "cauchy", "tukey")
 
 FACTOR = np.dtype(
     [
@@ -29,7 +32,7 @@ FACTOR = np.dtype(
         ("fresh", "i8"),  # not linearised yet
         ("kind", "i8"),  # of the reading; a displacement is the DVL's
         ("loss", "i8"),  # index in LOSSES
-        ("width", "f8"),  # of the loss
+        ("width", "f8"),  # of the loss, by its rows
         ("cov", "f8", (3, 3)),  # of the residual; a reading at its keyframe brings its own
         ("K", "f8", (3, 3)),  # of `given_rotation`
         ("n", "i8"),  # rows
@@ -42,19 +45,7 @@ FACTOR = np.dtype(
 """Lies beside its READING, its BLOCK where it is carried, and its DISPLACEMENT where it is one: same row of each."""
 
 
-@njit(cache=True, error_model="numpy")
-def weight_of(loss: int, d: float, width: float) -> float:
-    """w(d) of `robust`."""
-    if loss == 1:
-        return 1.0 if d <= width else width / d
-    if loss == 2:
-        return 1.0 / (1.0 + (d / width) ** 2)
-    if loss == 3:
-        return (1.0 - (d / width) ** 2) ** 2 if d <= width else 0.0
-    return 1.0
-
-
-@njit(cache=True, error_model="numpy")
+@inner
 def whiten(n: int, C: Array, r: Array, H: Array, H_j: Array) -> bool:
     """Divide n rows by the Cholesky factor of their covariance C, which is used up; False where it has none."""
     for k in range(n):
@@ -76,56 +67,77 @@ def whiten(n: int, C: Array, r: Array, H: Array, H_j: Array) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def linearise_factor(
     factors: NDArray[Any], f: int, readings: NDArray[Any], carries: NDArray[Any], displacements: NDArray[Any],
-    x_i: NDArray[Any], x_j: NDArray[Any], rig: NDArray[Any],
+    x_i: NDArray[Any], x_j: NDArray[Any], rig: NDArray[Any], widths: Array,
 ) -> bool:  # fmt: skip
-    """Linearise factor f at STATE records x_i and, for a displacement, x_j; False where its covariance is none.
+    """Linearise factor f at STATE records x_i and, for a displacement, x_j; False where it has no covariance.
 
-    The first time, a reading that is carried gets the noise of the block that carries it.
+    Args:
+        factors, readings, carries, displacements: row f of each is the factor.
+        x_i, x_j: where.
+        rig: RIG record.
+        widths: (kinds, 4) of the losses, by kind and number of rows.
     """
-    g = factors[f]
-    r, H, H_j, C = np.zeros(3), np.zeros((3, DIM)), np.zeros((3, DIM)), np.zeros((3, 3))
-    n, e = 3, x_j[0]
-    at = x_i.copy()
-    s = at[0]
+    g, C = factors[f], np.empty((3, 3))
     if g.form <= CARRIED:
-        F = np.zeros((DIM, DIM))
+        clear(g.H_j)
         if g.form == CARRIED:
-            predict(carries[f : f + 1], x_i, rig[0].gravity, F, at)
-        n = measure(readings, f, at, rig, r, H, C)
-        if g.form == CARRIED:
-            if g.fresh:
-                Q, HQ = np.empty((DIM, DIM)), np.zeros((3, DIM))
-                process_noise(carries[f : f + 1], x_i[0].R_WB, Q)
-                chain(n, H, Q, HQ)
-                for i in range(n):
-                    for j in range(n):
-                        for k in range(DIM):
-                            C[i, j] += HQ[i, k] * H[j, k]
-                g.cov[:] = C
-            C[:] = g.cov
-            of_end = H.copy()
-            chain(n, of_end, F, H)
-    else:
-        C[:] = g.cov
-        R_i, p_i, R_j, p_j = s.R_WB.copy(), s.p_WB_W.copy(), e.R_WB.copy(), e.p_WB_W.copy()
-        if g.form == LOOSE:
-            r[:] = preintegrated_dvl_residual(R_i, p_i, p_j, displacements[f].dp.copy(), H, H_j)
+            n = linearise_carried(factors, f, readings, carries, x_i, rig, C)
         else:
-            K = g.K.copy()
-            r[:] = tight_dvl_residual(R_i, p_i, s.b_g.copy(), R_j, p_j, displacements[f : f + 1], K, H, H_j)
-    if not whiten(n, C, r, H, H_j):
+            n = measure(readings, f, x_i, rig, g.r, g.H, C)
+    else:
+        n = 3
+        for i in range(3):
+            for j in range(3):
+                C[i, j] = g.cov[i, j]
+        s, e, d = x_i[0], x_j[0], displacements[f]
+        if g.form == LOOSE:
+            r = preintegrated_dvl_residual(s.R_WB, s.p_WB_W, e.p_WB_W, d.dp, g.H, g.H_j)
+        else:
+            of_f = displacements[f : f + 1]
+            r = tight_dvl_residual(s.R_WB, s.p_WB_W, s.b_g, e.R_WB, e.p_WB_W, of_f, g.K, g.H, g.H_j)
+        for i in range(3):
+            g.r[i] = r[i]
+    if not whiten(n, C, g.r, g.H, g.H_j):
         return False
-    g.n, g.fresh = n, 0
-    g.r[:], g.H[:], g.H_j[:] = r, H, H_j
-    g.weight = weight_of(g.loss, length(r, n), g.width)
+    g.n, g.fresh, g.width = n, 0, widths[g.kind, n]
+    g.weight = weight_of(g.loss, length(g.r, n), g.width)
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def chain(n: int, A: Array, F: Array, out: Array) -> None:
+@inner
+def linearise_carried(
+    factors: NDArray[Any], f: int, readings: NDArray[Any], carries: NDArray[Any], x_i: NDArray[Any],
+    rig: NDArray[Any], C: Array,
+) -> int:  # fmt: skip
+    """Fill r and H of a reading that the IMU carries to its keyframe, and C, its covariance; return how many rows.
+
+    C = C_z + H Q Hᵀ, with the noise of the block as it was the first time.
+    """
+    g, H, F, end = factors[f], np.empty((3, DIM)), np.empty((DIM, DIM)), np.empty(1, STATE)
+    predict(carries[f : f + 1], x_i, rig[0].gravity, F, end)
+    n = measure(readings, f, end, rig, g.r, H, C)
+    multiply_rows(n, H, F, g.H)
+    if g.fresh:
+        HQ = np.empty((3, DIM))
+        process_noise(carries[f : f + 1], x_i[0].R_WB, F)
+        multiply_rows(n, H, F, HQ)
+        for i in range(n):
+            for j in range(n):
+                for k in range(DIM):
+                    C[i, j] += HQ[i, k] * H[j, k]
+                g.cov[i, j] = C[i, j]
+    else:
+        for i in range(n):
+            for j in range(n):
+                C[i, j] = g.cov[i, j]
+    return n
+
+
+@inner
+def multiply_rows(n: int, A: Array, F: Array, out: Array) -> None:
     """out = A F for n rows."""
     for i in range(n):
         for j in range(DIM):
@@ -136,7 +148,7 @@ def chain(n: int, A: Array, F: Array, out: Array) -> None:
                     out[i, j] += A[i, k] * F[k, j]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def length(r: Array, n: int) -> float:
     """Of the first n components."""
     total = 0.0
@@ -145,7 +157,7 @@ def length(r: Array, n: int) -> float:
     return math.sqrt(total)
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def distance(factors: NDArray[Any], f: int, d_i: Array, d_j: Array) -> float:
     """Length of a factor's whitened residual at increments (15,) from where it was last linearised."""
     g, r = factors[f], np.empty(3)
@@ -156,11 +168,11 @@ def distance(factors: NDArray[Any], f: int, d_i: Array, d_j: Array) -> float:
     return length(r, g.n)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def linearise_tie(
     block: NDArray[Any], x_i: NDArray[Any], x_j: NDArray[Any], gravity: float, F: Array, Q: Array, c: Array
 ) -> None:
-    """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records.
+    """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; eq. (4).
 
     With x the prediction from x_i, the residual stands in the axes of B at j, as GTSAM's does (it matters only where
     one of the two is kept while the other moves):
@@ -170,38 +182,44 @@ def linearise_tie(
     Where x_j lies e off x, a rotation error that starts at x is carried there by Exp(−e), noise by J_r(e), and the two
     positions and velocities are seen turned by it: δp_j gains −[e_p]× R_j δθ_j, and δv_j likewise.
     """
-    end = np.empty(1, STATE)
+    end, matrices, e = np.empty(1, STATE), np.empty((3, 3, 3)), np.empty(3)
+    turn, S, A = matrices[0], matrices[1], matrices[2]
     predict(block, x_i, gravity, F, end)
     process_noise(block, x_i[0].R_WB, Q)
-    b = x_j[0]
     local(end, x_j, c)
-    e = c[THETA].copy()
+    for i in range(3):
+        e[i] = c[i]
     for i in range(DIM):
         c[i] = -c[i]
-    A = np.zeros((9, 3))  # what p and v gain by the rotation of j; c is minus the residual
-    A[3:6], A[6:9] = product(skew(c[POSITION]), b.R_WB), product(skew(c[VELOCITY]), b.R_WB)
-    turn_rows(F, exp(-e))
-    turn_covariance(Q, right_jacobian(e))
-    for i in range(3, 9):
-        for k in range(3):
-            c[i] += A[i, k] * c[k]
-            for j in range(DIM):
-                F[i, j] += A[i, k] * F[k, j]
-                Q[i, j] += A[i, k] * Q[k, j]
-    for i in range(3, 9):
-        for k in range(3):
-            for j in range(DIM):
-                Q[j, i] += A[i, k] * Q[j, k]
+    exp_into(c[THETA], turn)
+    turn_rows(F, turn)
+    right_jacobian_into(e, S)
+    turn_covariance(Q, S)
+    for begin in (POSITION_0, VELOCITY_0):  # what p and v gain by the rotation of j; c is minus the residual
+        skew_into(c[begin : begin + 3], S)
+        product_into(S, x_j[0].R_WB, A)
+        for i in range(3):
+            for k in range(3):
+                c[begin + i] += A[i, k] * c[k]
+                for j in range(DIM):
+                    F[begin + i, j] += A[i, k] * F[k, j]
+                    Q[begin + i, j] += A[i, k] * Q[k, j]
+        for i in range(3):
+            for k in range(3):
+                for j in range(DIM):
+                    Q[j, begin + i] += A[i, k] * Q[j, k]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
-    """Fill N(m, P) of the error at x that N(mean, anchor.P) of the error at the anchor makes; STATE records."""
+    """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor, STATE records; eq. (10)."""
+    J, lacking = np.empty((3, 3)), np.empty(3)
     local(anchor, x, m)
-    J = right_jacobian(m[THETA])
+    right_jacobian_into(m[THETA], J)
     for i in range(DIM):
         m[i] = mean[i] - m[i]
-    lacking = m[THETA].copy()
+    for i in range(3):
+        lacking[i] = m[i]
     transform_into(J, lacking, m[THETA])
-    P[:] = anchor[0].P
+    copy_into(anchor[0].P, P)
     turn_covariance(P, J)

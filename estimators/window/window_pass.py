@@ -1,51 +1,38 @@
 """One pass of the window: a fixed-lag smoother of our own, and the whole log where the window has no end.
 
-Gauss–Newton on the chain of keyframes (`window_chain`), with the policy and the factors of `graph_pass`. What costs
-time is compiled (`window_steps`); here is what allocates, and what talks to Python.
+Gauss–Newton on the chain of keyframes (`chain`), which follows the orders of `keyframes` as `graph` does. The steps are
+compiled (`steps`); here they are called in their order, and here is what allocates.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.epochs import IMU_SAMPLE, READING, SENSOR, Epoch
+from ...datasets.epochs import DVL, IMU_SAMPLE, READING, SENSOR, Epoch
 from ...datasets.rig import Rig
-from ...datasets.state import Belief
+from ...datasets.state import DIM, Belief
 from ...datasets.trajectory import Trajectory
+from ..between_keyframes import carry_on
 from ..interface import Diverged
-from ..keyframes import LONGEST_SILENCE_S
-from ..physics.dvl_preintegration import DISPLACEMENT
-from ..physics.imu import BLOCK, compile_rig, first_sample
-from ..physics.state import STATE, as_belief, as_record, with_rate_noise
-from ..robust import width
+from ..keyframes import SUMMED, Keyframes
+from ..physics.dvl_preintegration import DISPLACEMENT, given_rotation, preintegrate_dvl
+from ..physics.imu import BLOCK, compile_rig, first_sample, over_world
+from ..physics.state import STATE, as_belief, as_record, inject, retract, with_rate_noise
+from ..robust import LOSSES, width
 from ..smoothers import GraphSmoother
-from .chain import NODE
-from .factors import FACTOR, LOSSES
-from .steps import (
-    CAUSES,
-    CLOSE,
-    DONE,
-    FACTORS,
-    NODES,
-    OUT,
-    PENDING,
-    SAMPLES,
-    SOLVE,
-    STEP,
-    TICKS,
-    WINDOW,
-    Store,
-    believe,
-    drive,
-)
+from ..stages import stage
+from . import steps
+from .chain import NODE, smooth_covariances
+from .factors import FACTOR, LOOSE, TIGHT
+from .steps import CAUSES, MOST_ITERATIONS, NO_ROOM, NOT_POSITIVE, SOLVED, WINDOW, count_outliers
 
-NEVER_NS = 1 << 62
-NO_IMU, NO_READINGS = np.zeros(0, IMU_SAMPLE), np.zeros(0, READING)
+WORDS = IMU_SAMPLE.itemsize // 8
+"""Numbers of eight bytes in an IMU sample."""
 
 
 @dataclass(frozen=True)
@@ -69,41 +56,39 @@ class Solving:
 
 
 class WindowPass:
-    """One pass of a `GraphSmoother` on our own solver."""
+    """One pass of a `GraphSmoother` on our own solver; for the arrays see `steps.extend`."""
 
     def __init__(self, config: GraphSmoother, solving: Solving, prior: Belief, rig: Rig) -> None:
         if not (np.isfinite(prior.P).all() and np.linalg.eigvalsh(prior.P).min() > -1e-12 * np.abs(prior.P).max()):
-            raise Diverged("the prior's covariance is none")
-        self._window_s, self._lost = config.window_s, False
-        self._counted = sorted(config.robust)
-        self._begun = False
-        self._left: list[tuple[NDArray[Any], NDArray[Any]]] = []
-        w = np.zeros(1, WINDOW)
-        _tell(w[0], config, solving)
-        w["now_ns"] = w["dvl_heard_ns"] = w["covariance_due_ns"] = prior.t_ns
-        w["unsolved"], w["keyframes"], w["free"] = 1, 1, -1
-        anchor = as_record(prior)
-        self._store = Store(
-            w, np.zeros(16, NODE), np.zeros(16, STATE), np.zeros(16, BLOCK), anchor, np.zeros(15), np.zeros(0, FACTOR),
-            np.zeros(0, READING), np.zeros(0, BLOCK), np.zeros(0, DISPLACEMENT), np.zeros(256, IMU_SAMPLE),
-            np.zeros(16, READING), np.zeros(16, np.int64), np.zeros(16, STATE), np.zeros(16, np.int64),
-            compile_rig(rig, config.factors, config.inflate, config.earth_rotation),
-        )  # fmt: skip
-        self._make_room(FACTORS)
-        node = self._store.nodes[:1]
-        self._store.points[0] = anchor[0]
+            raise Diverged("the prior's covariance is not positive semi-definite")
+        self._config, self._solving = config, solving
+        self._lost = self._begun = self._swept = False
+        self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
+        self._keyframes = Keyframes(config, self._rig["inflate"][0], prior.t_ns)
+        self._now_ns = self._covariance_due_ns = prior.t_ns
+        self._ticks: deque[int] = deque()
+        self._smoothed: list[tuple[int, NDArray[Any]]] = []
+        self._w = _options(config, solving)
+        self._nodes, self._points, self._blocks = np.zeros(16, NODE), np.zeros(16, STATE), np.zeros(16, BLOCK)
+        self._factors, self._readings = np.zeros(0, FACTOR), np.zeros(0, READING)
+        self._carries, self._displacements = np.zeros(0, BLOCK), np.zeros(0, DISPLACEMENT)
+        self._imu = np.zeros(256, IMU_SAMPLE)
+        self._anchor = as_record(prior)
+        self._points[0] = self._anchor[0]
+        node = self._nodes[:1]
         node["P"] = node["P_given"] = prior.P
-        node["t_ns"], node["imu_from"], node["imu_to"], node["first"], node["dvl"] = prior.t_ns, 1, 1, -1, -1
+        node["t_ns"], node["imu_from"], node["first"] = prior.t_ns, 1, -1
+        self._add_free_factors()
+
+    # --- the interface -----------------------------------------------------------------------------------------------
 
     @property
     def counts(self) -> dict[str, int]:
         """See `Pass.counts`; keyframes linearised anew, and blocks factored, are `relinearised` and `refactored`."""
-        w = self._store.w[0]
-        names = ("keyframes", "carried", "merged", "late", "late_used", "preintegrated", "not_summed")
-        names += ("relinearised", "refactored")
-        counts = Counter({name: int(w[name]) for name in names})
+        w, counts = self._w[0], self._keyframes.counts
+        counts["relinearised"], counts["refactored"] = int(w["relinearised"]), int(w["refactored"])
         for kind, sensor in enumerate(SENSOR):
-            if sensor in self._counted:
+            if sensor in self._config.robust:
                 counts[f"outliers_{sensor}"] += int(w["outliers"][kind])
         return counts
 
@@ -111,18 +96,28 @@ class WindowPass:
         """See `Pass.step`."""
         if not self._begun:
             self._begun = True
-            self._store.imu[:1] = first_sample(epoch.imu, self._store.rig)
-            self._store.w["n_imu"] = 1
-        self._drive(STEP, epoch)
+            self._imu[:1] = first_sample(epoch.imu, self._rig)
+            self._w["n_imu"] = 1
+        self._now_ns = epoch.t_ns
+        if epoch.tick:
+            self._ticks.append(epoch.t_ns)
+        self._keep_samples(epoch.imu)
+        self._follow(self._keyframes.take(epoch.t_ns, epoch.readings))
 
+    @stage("output")
     def belief(self) -> Belief:
         """See `Pass.belief`."""
-        w, out = self._store.w[0], np.empty(1, STATE)
+        w = self._w[0]
         if w["unsolved"] <= w["newest"]:
-            self._drive(SOLVE, Epoch(int(w["now_ns"]), NO_IMU, NO_READINGS, False))
-        if (status := believe(self._store, out)) != DONE:
-            self._give_up(status)
-        return with_rate_noise(as_belief(int(self._store.w["now_ns"][0]), out), self._store.rig)
+            self._update(w["oldest"])
+        a = w["newest"] & (len(self._nodes) - 1)
+        node, state = self._nodes[a], self._points[a : a + 1].copy()
+        state["P"] = node["P"]
+        inject(state, node["m"])
+        waiting = self._keyframes.not_given_out()
+        if waiting or node["t_ns"] != self._now_ns:
+            carry_on(state, self._rig, *self._samples(a), self._now_ns, waiting, self._config.robust)
+        return with_rate_noise(as_belief(self._now_ns, state), self._rig)
 
     def finish(self) -> Trajectory | None:
         """See `Pass.finish`. States still in the window have seen less than the lag: all that there was."""
@@ -130,91 +125,198 @@ class WindowPass:
             raise Diverged("the estimate was lost before the end")
         if not self._begun:
             return None
-        self._drive(CLOSE, Epoch(int(self._store.w["now_ns"][0]), NO_IMU, NO_READINGS, False))
-        self._take_out()
-        beliefs = [
-            with_rate_noise(as_belief(int(t_ns), states[k : k + 1]), self._store.rig)
-            for times, states in self._left
-            for k, t_ns in enumerate(times)
-        ]
-        return Trajectory.from_beliefs(beliefs, self._window_s) if beliefs else None
+        self._follow(self._keyframes.finish())
+        w = self._w[0]
+        self._update(w["oldest"], self._solving.to_optimum)
+        smooth_covariances(self._nodes, w["oldest"], w["newest"])
+        self._swept = True
+        self._write_down(self._now_ns + 1)
+        count_outliers(self._w, self._nodes, self._factors, w["newest"] + 1)
+        beliefs = [with_rate_noise(as_belief(t_ns, state), self._rig) for t_ns, state in self._smoothed]
+        return Trajectory.from_beliefs(beliefs, self._config.window_s) if beliefs else None
 
-    def _drive(self, asked: int, epoch: Epoch) -> None:
-        while (status := drive(self._store, asked, epoch.imu, epoch.readings, epoch.t_ns, epoch.tick)) < 0:
-            self._make_room(-status)
-        if status != DONE:
-            self._give_up(status)
+    # --- a step, as docs/window.md derives it ------------------------------------------------------------------------
 
-    def _give_up(self, status: int) -> None:
+    def _follow(self, orders: NDArray[np.int64]) -> None:
+        """Do what `keyframes` has decided: extend the chain, write down what leaves, solve, and forget."""
+        n = 0
+        while n < len(orders):
+            while (done := self._extend(orders, n)) == NO_ROOM:
+                self._make_room(len(orders))
+            n = done
+            if n == len(orders):
+                return  # readings that came late: they wait for the next keyframe
+            if orders[n, 0] == SUMMED:
+                n = self._add_displacement(orders, n)
+            oldest = int(orders[n, 2])
+            until_ns = self._nodes["t_ns"][oldest & (len(self._nodes) - 1)]
+            if self._ticks and self._ticks[0] < until_ns:
+                self._write_down(until_ns)
+            self._update(oldest)
+            n += 1
+
+    @stage("propagation")
+    def _extend(self, orders: NDArray[np.int64], first: int) -> int:
+        return steps.extend(
+            self._w, self._nodes, self._points, self._blocks, self._factors, self._readings, self._carries, self._imu,
+            self._rig, self._keyframes.rows, orders, first,
+        )  # fmt: skip
+
+    @stage("linearisation")
+    def _add_displacement(self, orders: NDArray[np.int64], first: int) -> int:
+        """Add the preintegrated-DVL factor of the interval just closed; return the place of the order to solve."""
+        n = first
+        while orders[n, 0] == SUMMED:
+            n += 1
+        readings, mask = self._keyframes.rows[orders[first:n, 2]], len(self._nodes) - 1
+        k, tight = int(orders[first, 1]), "preintegrated-tight" in self._config.dvl
+        a = k & mask
+        x = self._points[a : a + 1].copy()
+        retract(x, self._nodes[a]["d"], x)
+        imu = over_world(self._samples(a)[1], x[0]["R_WB"], x[0]["b_g"], self._rig)
+        displacement = preintegrate_dvl(
+            imu, int(self._nodes[a]["t_ns"]), readings["t_ns"].copy(), readings["z"][:, :3].copy(),
+            self._rig["inflate"][0, DVL] * readings["sigma"], x[0]["b_g"], self._rig,
+            self._config.dvl_between == "straight",
+        )  # fmt: skip
+        N = displacement[0]["N"]
+        f = steps.add_factor(self._w, self._nodes, self._factors, k, DVL, TIGHT if tight else LOOSE)
+        self._displacements[f] = displacement[0]
+        self._factors["K"][f], self._factors["cov"][f] = given_rotation(N) if tight else (0.0, N[3:, 3:])
+        return n
+
+    def _update(self, oldest: int, to_optimum: bool = False) -> None:
+        """Solve with what is new by one Gauss–Newton step, and as many more as are asked for while anything moves.
+
+        Then forget the keyframes before `oldest`.
+        """
+        w = self._w[0]
+        if to_optimum:
+            w["unsolved"] = w["oldest"]
+        for _ in range(MOST_ITERATIONS if to_optimum else self._solving.extra_updates + 1):
+            first = self._linearise(to_optimum)
+            if first > w["newest"]:
+                break
+            reach = w["newest"] if to_optimum else self._solving.reach
+            status = self._solve(first, reach) if first >= w["oldest"] else NOT_POSITIVE
+            if status != SOLVED:
+                self._give_up(CAUSES[status])
+        else:
+            if to_optimum:
+                self._give_up("Gauss–Newton has not converged to an optimum of the whole log")
+        if oldest > w["oldest"]:
+            self._forget(oldest)
+
+    @stage("linearisation")
+    def _linearise(self, exact: bool) -> int:
+        return steps.linearise(
+            self._w, self._nodes, self._points, self._blocks, self._factors, self._readings, self._carries,
+            self._displacements, self._anchor, self._rig, exact,
+        )  # fmt: skip
+
+    @stage("solve")
+    def _solve(self, first: int, reach: int) -> int:
+        return steps.solve(self._w, self._nodes, self._points, self._factors, first, reach)
+
+    @stage("marginal")
+    def _forget(self, oldest: int) -> None:
+        steps.forget(self._w, self._nodes, self._points, self._factors, self._anchor, oldest)
+
+    def _give_up(self, cause: str) -> None:
         self._lost = True
-        raise Diverged(CAUSES[status])
+        raise Diverged(cause)
 
-    # --- room --------------------------------------------------------------------------------------------------------
+    # --- smoothed states ---------------------------------------------------------------------------------------------
 
-    def _make_room(self, short: int) -> None:
-        """Lengthen what the store is short of, or take out of it what nobody needs any more."""
-        s, w = self._store, self._store.w[0]
-        if short & NODES:
-            n, keyframes = len(s.nodes), np.arange(w["head"], w["newest"] + 1)
-            longer = {name: np.zeros(2 * n, getattr(s, name).dtype) for name in ("nodes", "points", "blocks")}
-            for name, ring in longer.items():
-                ring[keyframes & (2 * n - 1)] = getattr(s, name)[keyframes & (n - 1)]
-            s = s._replace(**longer)
-        if short & FACTORS:
-            n, more = len(s.factors), max(64, len(s.factors))
-            names = "factors", "readings", "carries", "displacements"
-            s = s._replace(**{name: _longer(getattr(s, name), n + more) for name in names})
-            s.factors["next"][n:] = np.append(np.arange(n + 1, n + more), w["free"])
-            w["free"], w["n_free"] = n, w["n_free"] + more
-        if short & SAMPLES:
-            gone = int(s.nodes["imu_from"][w["head"] & (len(s.nodes) - 1)] - 1 - w["imu_gone"])
-            kept = s.imu[gone : w["n_imu"]].copy()
-            imu = s.imu if 2 * gone > len(s.imu) else np.zeros(2 * len(s.imu), IMU_SAMPLE)
-            imu[: len(kept)] = kept
-            s = s._replace(imu=imu)
+    @stage("output")
+    def _write_down(self, until_ns: int) -> None:
+        """Write down the states at the ticks before until_ns, as they are seen now.
+
+        A tick is carried by the IMU from the keyframe before, with the IMU's noise since then added, although the
+        keyframe after it limits that too.
+        """
+        w, mask = self._w[0], len(self._nodes) - 1
+        k, newest = int(w["oldest"]), int(w["newest"])
+        while self._ticks and self._ticks[0] < until_ns:
+            t_ns = self._ticks.popleft()
+            while k < newest and self._nodes["t_ns"][(k + 1) & mask] <= t_ns:
+                k += 1
+            a = k & mask
+            node, state = self._nodes[a], self._points[a : a + 1].copy()
+            if t_ns >= self._covariance_due_ns:
+                self._covariance_due_ns = t_ns + self._config.hindsight_covariance_s * 1e9
+                if not self._swept:
+                    self._smooth_covariances(k, newest - 1)
+                state["P"] = node["P_smoothed"]
+            else:
+                state["P"] = np.nan
+            inject(state, node["d"])
+            if t_ns != node["t_ns"]:
+                carry_on(state, self._rig, *self._samples(a), t_ns)
+            self._smoothed.append((t_ns, state))
+
+    @stage("marginal")
+    def _smooth_covariances(self, low: int, newest: int) -> None:
+        smooth_covariances(self._nodes, low, newest)
+
+    # --- what is kept ------------------------------------------------------------------------------------------------
+
+    def _samples(self, a: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the IMU sample before the keyframe in place a of the rings, and those since."""
+        w, first = self._w[0], int(self._nodes["imu_from"][a] - self._w["imu_gone"][0])
+        return self._imu[first - 1 : first], self._imu[first : w["n_imu"]]
+
+    def _keep_samples(self, imu: NDArray[Any]) -> None:
+        w = self._w[0]
+        n, end = w["n_imu"], w["n_imu"] + len(imu)
+        if end > len(self._imu):
+            self._make_room(len(imu))
+            n, end = w["n_imu"], w["n_imu"] + len(imu)
+        if end > n:  # word by word: NumPy copies a record field by field, five times as slowly
+            self._imu.view(np.int64)[n * WORDS : end * WORDS] = imu.view(np.int64)
+            w["n_imu"] = end
+
+    def _make_room(self, more: int) -> None:
+        """See to it that as many more keyframes, factors and samples find room."""
+        w = self._w[0]
+        while w["n_free"] < more:
+            self._add_free_factors()
+        while w["newest"] - w["oldest"] + 1 + more > len(self._nodes):
+            n, kept = len(self._nodes), np.arange(w["oldest"], w["newest"] + 1)
+            for name in ("_nodes", "_points", "_blocks"):
+                ring = getattr(self, name)
+                longer = np.zeros(2 * n, ring.dtype)
+                longer[kept & (2 * n - 1)] = ring[kept & (n - 1)]
+                setattr(self, name, longer)
+        if w["n_imu"] + more > len(self._imu):
+            gone = int(self._nodes["imu_from"][w["oldest"] & (len(self._nodes) - 1)] - 1 - w["imu_gone"])
+            kept = self._imu[gone : w["n_imu"]].copy()
+            if 2 * (len(kept) + more) > len(self._imu):
+                self._imu = np.zeros(2 * (len(kept) + more + len(self._imu)), IMU_SAMPLE)
+            self._imu[: len(kept)] = kept
             w["n_imu"], w["imu_gone"] = len(kept), w["imu_gone"] + gone
-        if short & PENDING:
-            s = s._replace(pending=_longer(s.pending, 2 * len(s.pending)))
-        if short & TICKS:
-            done = int(w["ticks_done"])
-            kept = s.ticks[done : w["n_ticks"]].copy()
-            ticks = s.ticks if 2 * done > len(s.ticks) else np.zeros(2 * len(s.ticks), np.int64)
-            ticks[: len(kept)] = kept
-            s = s._replace(ticks=ticks)
-            w["n_ticks"], w["ticks_done"] = len(kept), 0
-        if short & OUT:
-            self._take_out()
-            n = max(2 * int(w["n_ticks"] - w["ticks_done"]) + 2, len(s.out))
-            s = s._replace(out=np.zeros(n, STATE), out_ns=np.zeros(n, np.int64))
-        self._store = s
 
-    def _take_out(self) -> None:
-        """Keep what has left the window."""
-        s = self._store
-        n = int(s.w["n_out"][0])
-        self._left.append((s.out_ns[:n].copy(), s.out[:n].copy()))
-        s.w["n_out"] = 0
+    def _add_free_factors(self) -> None:
+        w, n = self._w[0], len(self._factors)
+        more = max(64, n)
+        for name in ("_factors", "_readings", "_carries", "_displacements"):
+            rows = getattr(self, name)
+            setattr(self, name, np.concatenate([rows, np.zeros(more, rows.dtype)]))
+        self._factors["next"][n:] = np.append(np.arange(n + 1, n + more), w["free"])
+        w["free"], w["n_free"] = n, w["n_free"] + more
 
 
-def _longer(rows: NDArray[Any], n: int) -> NDArray[Any]:
-    """Return the rows with zeros behind them, n in all."""
-    return np.concatenate([rows, np.zeros(n - len(rows), rows.dtype)])
-
-
-def _tell(w: Any, config: GraphSmoother, solving: Solving) -> None:
-    """Fill in what a WINDOW record is told."""
-    w["window_ns"], w["merge_ns"] = config.window_s * 1e9, config.merge_ns
-    w["period_ns"], w["timeout_ns"] = config.period_s * 1e9, config.keyframe_timeout_s * 1e9
-    w["silence_ns"], w["hold_ns"] = int((config.period_s + LONGEST_SILENCE_S) * 1e9), config.max_hold_s * 1e9
-    w["covariance_ns"] = int(min(config.hindsight_covariance_s * 1e9, NEVER_NS))
-    w["preintegrates"], w["velocity"] = config.preintegrates, "velocity" in config.dvl
-    w["tight"], w["straight"] = "preintegrated-tight" in config.dvl, config.dvl_between == "straight"
+def _options(config: GraphSmoother, solving: Solving) -> NDArray[Any]:
+    """Return a WINDOW record with the options filled in."""
+    w = np.zeros(1, WINDOW)
     rotation, position, velocity, bias = solving.relinearize
     w["thresholds"] = np.repeat([rotation, position, velocity, bias, bias], 3)
-    w["extra_updates"], w["whole"] = solving.extra_updates, solving.relinearize_prior
-    w["reach"], w["to_optimum"] = solving.reach, solving.to_optimum
+    assert w["thresholds"].shape == (1, DIM)
+    w["relinearize_prior"] = solving.relinearize_prior
+    w["reach"], w["unsolved"], w["free"] = solving.reach, 1, -1
     for kind, sensor in enumerate(SENSOR):
         loss = config.robust.get(sensor)
         if loss is not None:
-            w["loss"][kind] = LOSSES.index(loss)
-            w["width"][kind, 1:] = [width(loss, n) for n in (1, 2, 3)]
+            w["loss"][0, kind] = LOSSES.index(loss)
+            w["widths"][0, kind, 1:] = [width(loss, n) for n in (1, 2, 3)]
+    return w

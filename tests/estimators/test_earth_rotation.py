@@ -369,14 +369,15 @@ def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     return sums
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "output"),
     [
         ("eskf", "online"),
         ("rts", "smoothed"),
-        pytest.param("iekf", "online", marks=pytest.mark.slow),
-        pytest.param("ukf", "online", marks=pytest.mark.slow),
-        pytest.param("fls", "online", marks=pytest.mark.slow),
+        ("iekf", "online"),
+        ("ukf", "online"),
+        ("fls", "online"),
     ],
 )
 def test_the_navigation_grade_is_honest_only_for_who_knows(name: str, output: str) -> None:

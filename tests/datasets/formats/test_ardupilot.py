@@ -238,6 +238,7 @@ print((after - before) * (1 if sys.platform == "darwin" else 1024), len(columns[
 """
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_what_is_wanted(tmp_path):
     """40 MB of log of which 0.1 MB is wanted: the file is neither held nor indexed."""
     other = b"".join(imu(i) for i in range(1000))

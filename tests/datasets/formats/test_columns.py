@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -175,6 +176,7 @@ print((after - before) * (1 if sys.platform == "darwin" else 1024), len(t_ns), i
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_memory_is_that_of_the_wanted_columns(tmp_path, suffix):
     """A table of 110 MB and 20 columns, of which 3 are wanted: 300,000 rows, 7 MB."""
@@ -307,15 +309,14 @@ class Touch:
 
 
 @pytest.fixture(scope="module")
-def comma(recorded_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Log:
+def comma(recording: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Log:
     """As catalogued, but with every speed."""
-    if not (recorded_data / "comma2k19_example1").is_dir():
-        pytest.skip(f"no comma2k19_example1 in {recorded_data}")
+    recorded = recording("comma2k19_example1")
     described = (CATALOG / "comma2k19_example1.yaml").read_text(encoding="utf-8")
     assert "every: 8" in described
     every = tmp_path_factory.mktemp("comma") / "comma2k19_example1.yaml"
     every.write_text(described.replace("every: 8", "every: 1"), encoding="utf-8")
-    return open_log(every, recorded_data / "comma2k19_example1")
+    return open_log(every, recorded)
 
 
 def at(t_ns: Any, log_t_ns: Any, values: Any) -> Any:

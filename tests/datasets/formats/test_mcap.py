@@ -241,6 +241,7 @@ def test_contents_lists_the_topics(small, tmp_path, encoding):
         assert {"z.0", "sigma.0", "stamp" if encoding == "protobuf" else "header.stamp"} <= fields
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
 def test_what_is_not_wanted_costs_no_memory(tmp_path, compression):
     """160 MB of other messages around 20,000 small ones."""

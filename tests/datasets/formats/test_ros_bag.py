@@ -347,6 +347,7 @@ def test_contents_lists_the_topics(small, ros1):
     assert {"header.stamp", "orientation.w", "linear_acceleration_covariance.0"} <= set(imu.fields)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2])
 def test_what_is_not_wanted_costs_no_memory(tmp_path, version):
     """160 MB of images around 8 MB of IMU samples; 3 columns of them are wanted."""
@@ -397,15 +398,16 @@ def test_a_damaged_bag_gives_a_log_or_an_error(fuzzed, seed, which):
 # ------------------------------------------------------------------------------------------------------ a recorded one
 
 
-def test_huskys_axes_are_the_vehicles(recorded_data):
+def test_huskys_axes_are_the_vehicles(recording):
     """Gravity is felt upwards, the gyro turns with the wheels, the accelerometer with speed times yaw rate."""
-    log = open_log("husky_rl_test1_2015", recorded_data)
+    folder = recording("husky_rl_test1_2015")
+    log = open_log("husky_rl_test1_2015", folder.parent)
     assert len(log.imu.t_ns) == 11_865
     R_BI = np.asarray(log.rig.imu.R_BS)
     f_B, w_B = log.imu.f_I @ R_BI.T, log.imu.w_WI_I @ R_BI.T
     assert abs(f_B[:, 2].mean() - 9.8) < 0.05
     odometry = RosRecording(format="ros", file="test1.bag").read(
-        recorded_data / "husky_rl_test1_2015",
+        folder,
         [Wanted("/husky_velocity_controller/odom", None, ("header.stamp", "log_time", "twist.twist.angular.z"))],
     )
     wheels = odometry.columns[0]

@@ -57,6 +57,7 @@ def test_filter_and_smoother_agree_online(mission: str) -> None:
     assert np.abs(ratio[60:] - 1).max() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [3.0, 10.0])
 def test_hindsight_beats_the_moment(lag_s: float) -> None:
     """Pooled over seeds: a smoother that loses to its own filter has a bug. Velocity shows it best; position drifts."""
@@ -89,6 +90,7 @@ def test_one_second_keyframes_lose_nothing() -> None:
     assert position_gap_in_sigma(every.online, sparse.online, 20.0).max() < 0.3
 
 
+@pytest.mark.slow
 def test_preintegrated_dvl_navigates_about_as_well_as_velocity() -> None:
     log = simulate(replace(TACTICAL, duration_s=60.0), seed=2)
     results = {
@@ -167,6 +169,7 @@ def test_late_readings_inside_the_window_are_used_and_older_ones_counted() -> No
     assert beyond.counts["late"] > 0.9 * sum(len(s) - 30 for s in (late.gps, late.heading))
 
 
+@pytest.mark.slow
 def test_a_late_reading_is_worth_the_same_in_hindsight() -> None:
     scenario = replace(TACTICAL, duration_s=60.0)
     in_time, late = simulate(scenario, seed=3), simulate(_late(scenario, 1.0), seed=3)
@@ -204,6 +207,7 @@ def test_what_no_sensor_tells_of_stays_unknown_when_a_keyframe_has_turned() -> N
     assert np.abs(fls.p_WB_W - eskf.p_WB_W).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_long_window_finds_the_optimum_of_its_whole_graph() -> None:
     """Everything the smoother was ever given, solved by Levenberg–Marquardt: the same positions to 1 mm."""
     log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=6)
@@ -337,6 +341,7 @@ def test_diverged_is_raised_when_numbers_are_lost() -> None:
 # --- what must not matter ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_odd_rates_and_delays_leave_filter_and_smoother_in_agreement() -> None:
     """Nothing falls on a keyframe or a tick, and readings come late: a tenth of a sigma all the same."""
     scenario = replace(

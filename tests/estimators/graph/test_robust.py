@@ -112,6 +112,7 @@ def _plain() -> tuple[Log, Driven]:
     return log, run_log(log, create("fls"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_with_honest_noise_a_loss_changes_little_and_counts_what_theory_says(loss: Loss) -> None:
     """The plain estimate is efficient, so the robust one's variance is the plain one's plus that of their difference
@@ -137,6 +138,7 @@ def _spoilt(log: Log) -> tuple[Log, int]:
     return replace(log, gps=replace(log.gps, z=z)), int(np.count_nonzero(log.gps.received_ns[bad] <= log.imu.t_ns[-1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_one_gps_reading_in_ten_fifty_metres_off_ruins_the_plain_smoother_only(loss: Loss) -> None:
     log, plain = _plain()
@@ -150,6 +152,7 @@ def test_one_gps_reading_in_ten_fifty_metres_off_ruins_the_plain_smoother_only(l
     assert low <= robust.counts["outliers_gps"] - n <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fls-batch", "isam2", "batch"])
 def test_every_smoother_on_gtsam_takes_a_loss(name: str) -> None:
     log, plain = _plain()
@@ -178,6 +181,7 @@ def test_a_gps_without_height_works_under_a_loss(loss: Loss) -> None:
     assert rmse_m(log.truth, result.online) < rmse_m(log.truth, plain.online) + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [0.0, 0.5, 3.0])
 def test_preintegrated_dvl_takes_the_dvls_loss(lag_s: float) -> None:
     """Once the biases are known, one velocity in forty is 5 m/s off, so one displacement in eight is 1 m off."""
