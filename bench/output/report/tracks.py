@@ -18,11 +18,11 @@ from ..figures.track import Track, error_m, has_bounds, is_near, tracks_of
 from .curves import named
 
 POSES = 200_000
-"""How many poses a page may hold; one is 48 bytes of it."""
+"""Poses that a page may hold, 48 bytes each: some 10 MB."""
 OF_A_TRACK = (2000, 1000, 500, 200)
-"""How many poses of one track are drawn: the first for which one seed of each log has room, and the last anyhow."""
+"""Poses drawn of one track: the most for which one seed of each log has room, else the least of these."""
 MOST_SEEDS = 10
-"""How many seeds of a log are drawn at most: nobody looks at hundreds, and reading them takes its time."""
+"""Seeds of a log that are drawn at most: more take long to read, and are too many to look through."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Drawn:
     """What is drawn of one log.
 
     Attributes:
-        seeds: what the page's script is given, by seed; None for a recorded log.
+        seeds: what the page's script reads, by seed; the seed of a recorded log is None.
         every: one pose in so many is shown.
         poses: how many the longest track has.
         left_out: how many seeds are not drawn.
-        missing: trajectories that rows speak of and that cannot be read, and why.
+        missing: trajectories that cannot be read, and why.
     """
 
     seeds: dict[int | None, Any] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class Drawn:
 
 
 def draw_all(rows: Sequence[Record], folder: Path) -> dict[str, Drawn]:
-    """Read of each log as many seeds as the page has room for: first those with a run that did not come to its end.
+    """Read as many seeds of each log as the page has room for; seeds with a run that did not finish come first.
 
     Args:
         rows: of the store.
@@ -88,14 +88,14 @@ def _draw(by_seed: Mapping[int | None, Sequence[Record]], folder: Path, most: in
 
 
 def _read(row: Record, folder: Path, missing: list[str]) -> Track | None:
-    """Return the track of a row; None where there is none to compare, or after adding to `missing` what is wrong."""
+    """Return the track of a row; None if it has no score, or if it cannot be read, which is added to `missing`."""
     for name in (row["trajectory"], row["truth_trajectory"]):
         if name is not None and not (folder / name).is_file():
             missing.append(f"{name}: not there")
             return None
     try:
         tracks, _ = tracks_of([row], folder)
-    except (OSError, ValueError, KeyError) as error:  # a file that was cut off, or is none of ours
+    except (OSError, ValueError, KeyError) as error:  # a truncated file, or not one of ours
         missing.append(f"{row['trajectory']}: {one_line(error)}")
         return None
     return tracks[0] if tracks else None

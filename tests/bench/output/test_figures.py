@@ -184,7 +184,7 @@ def test_a_log_whose_readings_lay_outside_is_named_with_their_number(rows: pd.Da
     assert printed(rows.assign(counts=counts), tmp_path).count(lost) == 1
 
 
-# -- honesty ----------------------------------------------------------------------------------------------------------
+# -- consistency -------------------------------------------------------------------------------------------------------
 
 JUDGED = ("dead-reckoning", "eskf", "overconfident", "rts")
 
@@ -208,7 +208,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path
     return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
 
 
-def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_the_consistency_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     summary = {(row["label"], row["output"]): row for row in summarise(rows)}
     honest, wrong = summary["eskf", "online"], summary["overconfident", "online"]
@@ -230,7 +230,7 @@ def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame
     assert "gps" not in lines[2]
 
 
-def test_the_widest_honesty_table_fits_120_columns(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_the_widest_consistency_table_fits_120_columns(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     labels = rows["label"].replace({label: f"{label:-<24}" for label in JUDGED})
     text = printed(
@@ -241,7 +241,7 @@ def test_the_widest_honesty_table_fits_120_columns(judged: tuple[pd.DataFrame, P
     assert "…" not in text
 
 
-def test_few_seeds_without_nis_have_no_honesty_table(rows: pd.DataFrame, tmp_path: Path) -> None:
+def test_few_seeds_without_nis_have_no_consistency_table(rows: pd.DataFrame, tmp_path: Path) -> None:
     assert ": consistency" not in printed(rows, tmp_path)
     assert "late readings" not in printed(rows, tmp_path)
 
