@@ -28,7 +28,7 @@ def _once(dvl: frozenset[DvlFactor]) -> frozenset[DvlFactor]:
 
 @dataclass(frozen=True)
 class GraphSmoother(ABC):
-    """Options of every factor-graph smoother.
+    """Options of every factor-graph smoother; its DVL factors are docs/conventions.md (4), (6) and (20).
 
     Each DVL reading makes a keyframe; with keyframe_period_s, the first DVL reading after that time does. If the DVL is
     silent for keyframe_timeout_s, the next reading of another sensor makes one. If all sensors are silent, time makes
@@ -36,8 +36,8 @@ class GraphSmoother(ABC):
     is carried on by the IMU and corrected as in a filter; the graph does not use that.
 
     Attributes:
-        dvl: how DVL readings enter. "velocity": one velocity factor for each (eq. 4). "preintegrated-loose": readings
-            are summed to a displacement between keyframes (eq. 6), rotated by the gyro at its current bias, as if that
+        dvl: how DVL readings enter. "velocity": one velocity factor for each. "preintegrated-loose": readings
+            are summed to a displacement between keyframes, rotated by the gyro at its current bias, as if that
             gyro were independent of the IMU factor's. "preintegrated-tight": the same displacement, conditioned on the
             rotation between the keyframes and on the gyro bias, so that each gyro sample is used once. Name at most one
             of the two. Over a second they differ little; over 5 s with a consumer-grade gyro, loose is overconfident
