@@ -119,7 +119,7 @@ def _bare(kind: Any) -> Any:
 
 
 def _tag(kind: Any) -> str | None:
-    """Return the tag by which a member of a union is told apart; None where it has none."""
+    """Return the tag that identifies a member of a union; None if it has none."""
     return next((note.tag for note in getattr(kind, "__metadata__", ()) if hasattr(note, "tag")), None)
 
 

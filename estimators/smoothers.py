@@ -36,8 +36,8 @@ class GraphSmoother(ABC):
     does not see that.
 
     Attributes:
-        dvl: how DVL readings enter. "velocity": each by its own factor (eq. 4). "preintegrated-loose": summed to a
-            displacement from keyframe to keyframe (eq. 6), turned by the gyro at the bias of the moment, as if the IMU
+        dvl: how DVL readings enter. "velocity": each by its own factor. "preintegrated-loose": summed to a
+            displacement from keyframe to keyframe, turned by the gyro at the bias of the moment, as if the IMU
             factor had another gyro. "preintegrated-tight": the same displacement given the rotation between the
             keyframes and the gyro bias, so that with the IMU factor each gyro sample counts once. One of these two
             at most: over a second they differ little; over 5 s with a consumer's gyro, loose claims to know the

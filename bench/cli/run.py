@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from .options import Data, ExperimentName, Jobs, Repair, Results
 from .verb import BAD_INPUT, SOME_FAILED, on_interrupt
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def run(
@@ -38,13 +41,18 @@ def run(
     """
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
-    from ..output.present import present
+    from ..output.present import present, print_log
 
     plan = Experiment.load(experiment)
-    folder = out / plan.name
+    folder, printed = out / plan.name, []
+
+    def show(rows: pd.DataFrame) -> None:
+        print_log(rows, plan)
+        printed.append(rows["log"].iloc[0])
+
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
-        outcome = sweep(plan, data, out, jobs, only, repair, force, dask)
-    present(outcome, plan, folder)
+        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, show)
+    present(outcome, plan, folder, printed)
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)

@@ -13,28 +13,13 @@ from ...datasets.epochs import SENSOR
 from ...datasets.log import Log
 from ...datasets.quantities import Positive
 from ...datasets.trajectory import Trajectory
-from . import (
-    BLOCKS,
-    Alignment,
-    Dims,
-    Pairs,
-    ScoreError,
-    Unit,
-    align,
-    associate,
-    ate,
-    check_step,
-    coverage,
-    drift,
-    horizontal_error,
-    nees,
-    not_positive,
-    outage_drift,
-    rpe,
-    segment_errors,
-    state_errors,
-)
+from .absolute_error import ate, drift, horizontal_error, outage_drift
+from .alignment import Alignment, align
+from .association import ScoreError, associate
 from .floor_ratio import FLOORS
+from .pose_error import Dims
+from .relative_error import Pairs, Unit, check_step, rpe, segment_errors
+from .state_error import BLOCKS, coverage, nees, not_positive, state_errors
 
 SCORES = {
     "n_scored": "poses compared",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,20 @@ from .tables.table import print_table, write_consistency, write_paired, write_ta
 say = partial(typer.echo, err=True)
 
 
-def present(outcome: Outcome, plan: Experiment, folder: Path) -> None:
-    """Write the CSV files and the figures of all that was run of this plan, and print the tables of these rows."""
+def print_log(rows: pd.DataFrame, plan: Experiment) -> None:
+    """Print the tables of a log whose runs have all ended, while others still run."""
+    print_table(rows_of(rows, plan.runs()))
+
+
+def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collection[str] = ()) -> None:
+    """Write the CSV files and the figures of all that was run of this plan, and print what `print_log` has not.
+
+    Args:
+        outcome: of the sweep.
+        plan: what was run.
+        folder: of the experiment's results.
+        printed: logs whose tables are printed already.
+    """
     rows = outcome.rows
     every = rows_of(load_runs(folder), plan.runs())
     others = every.loc[~every["identity"].isin(rows["identity"])]
@@ -43,7 +56,10 @@ def present(outcome: Outcome, plan: Experiment, folder: Path) -> None:
     say(f"{folder}: runs.sqlite, table.csv, table.tex, consistency.csv, paired.csv, {len(figures)} figures")
     _write_report(every, plan, folder, differences)
     shown = set(zip(rows["log"], rows["label"], strict=True))
-    print_table(rows, differences=[row for row in differences if (row["log"], row["label"]) in shown])
+    print_table(
+        rows.loc[~rows["log"].isin(printed)],
+        differences=[row for row in differences if (row["log"], row["label"]) in shown],
+    )
     if outcome.standing:
         say(f"{outcome.standing} runs were done already; --force does them again")
     if outcome.renewed:

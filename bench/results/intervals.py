@@ -14,6 +14,7 @@ from .paired import FEWEST_SEEDS, TAKE, bootstrap_interval
 from .summary import Record, groups, records, summarise
 
 RESAMPLES = 1999
+"""Ends of a 95 % interval are then the 50th from either side."""
 TABLED = ("ate_rmse_m", "heading_rmse_deg", "drift_end_percent", "rpe_rmse_m")
 """Scores whose intervals stand in table.csv and table.tex."""
 

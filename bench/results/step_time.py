@@ -20,6 +20,7 @@ from ...datasets.state import Array, TimeArray
 PER_DECADE = 40
 """Bins per factor of ten: one is 5.9 % wide."""
 DECADES = 13
+"""1 ns to 10⁴ s."""
 EDGES_NS: Array = 10.0 ** (np.arange(PER_DECADE * DECADES + 1) / PER_DECADE)
 """From a nanosecond to nearly three hours."""
 

@@ -28,9 +28,11 @@ from ..metrics import ate
 from ..metrics.scoring import scores
 from . import evo
 from .budgets import Budget, Measured, take_turns
+from .compiling import compile_cpu_seconds
 from .whole_runs import finished_again_mb, finished_again_s, whole_run
 
 LAGS_S = (3.0, 10.0, 30.0)
+"""The lags of the main experiment, and a long one."""
 CHEAPER = ({}, {"wildfire": 0.1}, {"wildfire": 0.1, "relinearize": [0.05, 1e3, 0.5, 10.0]})
 """Settings of `fls`, each cheaper than the one before."""
 
@@ -81,6 +83,12 @@ def python_factor() -> Measured:
     ours(FACTORS)
     native(FACTORS)
     return Measured(take_turns(partial(ours, FACTORS), partial(native, FACTORS), 7))
+
+
+def compiling() -> Measured:
+    """Measure the processor time of compiling `eskf`, `fls` and `window` into an empty cache, s."""
+    found = compile_cpu_seconds(("eskf", "fls", "window"))
+    return Measured((found.cpu_s,), f"{found.compilations} compilations")
 
 
 def window_against_fls(lag_s: float) -> Measured:
@@ -221,6 +229,7 @@ BUDGETS: Sequence[Budget] = (
     Budget("eskf-filterpy over eskf, same log", 5.0, True, filter_against_filterpy),
     Budget("our Python factor over a native one, 3 × 12", 10.0, False, python_factor),
     *(Budget(f"fls over window, lag {s:g} s", 20.0, True, partial(window_against_fls, s)) for s in LAGS_S),
+    Budget("compiling eskf, fls and window from nothing", 75.0, False, compiling, unit="s"),
     Budget("20,000 finished runs, the same command again", 15.0, False, finished_again_s, unit="s"),
     Budget("20,000 finished runs, peak memory of it", 500.0, False, finished_again_mb, unit="MB"),
     Budget("eskf's run in a worker over its work, 20 s", 2.5, False, partial(whole_run, 20.0)),

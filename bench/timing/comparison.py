@@ -41,6 +41,7 @@ LEAST_S = 0.02
 """A turn is repeated until it takes this long: shorter ones measure the clock."""
 
 RESAMPLES = 5_000
+"""Ends of a 95 % interval are then the 125th from either side."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Effort:
 
 
 FULL, SHORT = Effort(5, 4), Effort(3, 3)
+"""Of a long and of a short benchmark."""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from .printing import machine_text, made
 
 EXPERIMENT = "cost"
 LAGS_S = (3.0, 10.0, 30.0)
+"""The lags of the main experiment, and a long one."""
 COLUMNS = (
     "estimator",
     "µs per IMU sample",
@@ -34,6 +35,7 @@ COLUMNS = (
 BEGIN, END = "<!-- cost: fathom timing cost -->", "<!-- /cost -->"
 """Between these two lines of a page stands the table."""
 BOOTSTRAPS = 2000
+"""Resamples: the ends of a 95 % interval are then the 50th from either side."""
 
 
 def cost_records(rows: pd.DataFrame) -> list[Record]:

@@ -32,6 +32,7 @@ SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(
 
 
 BOOTSTRAP = {"confidence_level": 0.95, "n_resamples": 9999}
+"""Of every interval: scipy's own number of resamples."""
 
 
 class Marks(NamedTuple):

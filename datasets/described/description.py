@@ -536,7 +536,7 @@ def check_description(raw: dict[Any, Any], where: str) -> Description:
 
 
 def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple[str, ...] = ()) -> Checked:
-    """Return the part that `raw` describes, which stands at `above` in the description."""
+    """Return the validated part, whose path in the description is `above`."""
     try:
         return model.model_validate(raw)
     except ValidationError as error:

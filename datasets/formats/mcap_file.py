@@ -222,7 +222,7 @@ def _protobuf_channel(topic: str, kind: str, schema: Any, where: str) -> Channel
 
 
 def _protobuf_fields(descriptor: Any, prefix: str, above: tuple[str, ...]) -> Iterator[str]:
-    """Yield the paths of a type's numbers; of a repeated field, that of its first element."""
+    """Yield the paths of a type's numeric fields; for a repeated field, that of its first element."""
     if descriptor.full_name in above:
         return  # a type may contain itself: it is listed once
     for field in descriptor.fields:
@@ -249,16 +249,16 @@ def _code(field: Any) -> str | None:
 
 
 class ProtobufExtractor:
-    """Takes wanted numbers out of messages of one type of Protocol Buffers; an `Extractor`.
+    """Extracts wanted numbers from messages of one type of Protocol Buffers; an `Extractor`.
 
-    What a message leaves out and could have had is NaN; an integer or a time left out makes its message a misfit.
+    An absent float is NaN; a message without a wanted integer or time is malformed.
     """
 
     def __init__(self, decode: Callable[[bytes], Any], wanted: Sequence[str], where: str) -> None:
         """Compile the reader.
 
         Raises:
-            DatasetError: a column that is no number of the type (with the nearest).
+            DatasetError: a column that is not a numeric field of the type (with the nearest).
         """
         self._decode = decode
         descriptor = decode(b"").DESCRIPTOR
@@ -287,11 +287,11 @@ class ProtobufExtractor:
 
 
 Path_ = tuple[tuple[str, bool, int | None], ...]
-"""Steps into a message: field, whether it may be absent, and the index into it where it is repeated."""
+"""Steps into a message: field, whether it may be absent, and the index if it is repeated."""
 
 
 def _protobuf_path(descriptor: Any, column: str) -> tuple[Path_, str | None]:
-    """Return the steps to a number and its code; None where there is no such number."""
+    """Return the steps to a number and its code; None if there is no such number."""
     steps: list[tuple[str, bool, int | None]] = []
     names = column.split(".")
     while names:
@@ -333,7 +333,7 @@ def _protobuf_value(message: Any, column: str, steps: Path_, code: str) -> Any:
 
 
 class JsonExtractor:
-    """Takes wanted numbers out of JSON objects; an `Extractor`. A number left out, or null, is NaN."""
+    """Extracts wanted numbers from JSON objects; an `Extractor`. An absent number, or null, is NaN."""
 
     def __init__(self, wanted: Sequence[str], where: str) -> None:
         self._wanted, self._where = tuple(wanted), where
@@ -386,7 +386,7 @@ class JsonExtractor:
 
 
 def _json_number(value: Any) -> int | float | None:
-    """Return a number, or a time's nanoseconds; None where it is neither."""
+    """Return a number, or the nanoseconds of a time; None if it is neither."""
     if isinstance(value, int | float):
         return value if isinstance(value, float) else int(value)
     if isinstance(value, dict):

@@ -1,8 +1,8 @@
 """ROS 1 bags (.bag) and ROS 2 bags (a folder, .db3 or .mcap), without ROS.
 
-ROS 1 bags are read from front to back and not by their index, which stands at their end: a recorder that lost its
-power has not written it. ROS 2 bags in SQLite seldom carry the definitions of their messages; those of ROS itself
-come with `rosbags`, by distribution, and those of common DVLs with this package.
+ROS 1 bags are read from front to back, without their index: it is at the end, and missing if the recorder lost its
+power. ROS 2 bags in SQLite seldom contain the definitions of their messages. Those of ROS itself come with `rosbags`,
+by distribution, and those of common DVLs with this package.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from .topics import NS, Channel, Message, ScanResult, TopicRecording
 
 MAGIC_1 = b"#ROSBAG V2.0\n"
 MESSAGE_DATA, CHUNK, CONNECTION = 2, 5, 7
-"""Kinds of records of a ROS 1 bag, their `op`."""
+"""Values of `op`, the kind of a record of a ROS 1 bag."""
 DISTRO = "humble"
-"""The ROS 2 distribution whose definitions are taken where a bag does not name one."""
+"""The ROS 2 distribution whose definitions are used if a bag does not name one."""
 _U32 = struct.Struct("<I")
 
 
 class RosRecording(TopicRecording):
-    """A ROS bag, version 1 or 2, as it is found. Messages are topics; `log_time` is when each was recorded."""
+    """A ROS bag, version 1 or 2. Messages are topics; `log_time` is when each was recorded."""
 
     host_clock = ("log_time", "ns")
     suffixes = (".bag", ".bag.active", ".db3")
@@ -42,7 +42,7 @@ class RosRecording(TopicRecording):
     more: tuple[str, ...] = ()
     """Further files of a split ROS 1 bag, in their order; the folder of a ROS 2 bag names its own."""
     distro: str | None = None
-    """ROS 2 distribution whose definitions count where the bag has none; by default the bag's own, else humble."""
+    """ROS 2 distribution whose definitions are used for a bag without its own; by default the bag's, else humble."""
     definitions: tuple[str, ...] = ()
     """Files of further definitions: `…/package/msg/Name.msg`, or many in one, under lines `MSG: package/Name`."""
 
@@ -63,7 +63,7 @@ class RosRecording(TopicRecording):
 
 
 def own_definitions(folder: Path, files: Sequence[str]) -> dict[str, Definition]:
-    """Return the definitions in files of the user's."""
+    """Return the definitions in the user's files."""
     types: dict[str, Definition] = {}
     for file in files:
         path = folder / file
@@ -79,16 +79,16 @@ def own_definitions(folder: Path, files: Sequence[str]) -> dict[str, Definition]
 
 @cache
 def shipped_definitions() -> dict[str, Definition]:
-    """Return the definitions of common DVLs, which ROS does not bring along."""
+    """Return the definitions of common DVLs, which are not part of ROS."""
     path = Path(__file__).parent / "ros_definitions" / "dvl.msg"
     return parse_definitions(path.read_text(encoding="utf-8"), "", str(path))
 
 
 class _Distribution(dict[str, Definition]):
-    """Definitions that a ROS 2 distribution brings, looked up when they are asked for."""
+    """Definitions of a ROS 2 distribution, looked up on demand."""
 
     def __init__(self, asked: str | None, recorded: str, where: str) -> None:
-        """`asked` is the user's; else that of the recording counts where it is known (it may say `rolling`)."""
+        """`asked` is the user's distribution; without one, that of the recording is used, if known."""
         super().__init__()
         self._asked, self._recorded, self._where = asked, recorded, where
 
@@ -116,7 +116,7 @@ class _Distribution(dict[str, Definition]):
 
 
 def ros1_messages(path: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
-    """Yield the messages of a ROS 1 bag; what is damaged is skipped and told in `found.notes`.
+    """Yield the messages of a ROS 1 bag; damaged parts are skipped and counted in `found.notes`.
 
     Raises:
         DatasetError: not a ROS 1 bag of version 2.0, or contains no whole message.
@@ -157,7 +157,7 @@ def ros1_messages(path: Path, topics: Collection[str] | None, found: ScanResult)
 
 
 class _Bag:
-    """What is known of a ROS 1 bag while its records go by."""
+    """The connections of a ROS 1 bag, while its records are read."""
 
     def __init__(self, path: Path, topics: Collection[str] | None, found: ScanResult) -> None:
         self.path, self.topics, self.found = path, topics, found
@@ -298,7 +298,7 @@ def _ros2_messages(
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """Return what metadata.yaml says; a recorder that did not finish has not written it."""
+    """Return the contents of metadata.yaml; empty if the recorder did not finish and write it."""
     file = path / "metadata.yaml"
     if not file.is_file():
         return {}
@@ -346,7 +346,7 @@ def _uncompressed(file: Path) -> Iterator[Path]:
 
 
 def _zstd(data: bytes) -> bytes:
-    """Return a message decompressed; one that is damaged is empty, and no message of its type."""
+    """Return a message decompressed; a damaged one is empty, which does not fit its type."""
     with extra("ros"):
         import zstandard
     try:
@@ -358,7 +358,7 @@ def _zstd(data: bytes) -> bytes:
 def _sqlite_messages(
     plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
-    """Yield the messages of a SQLite database; `path` is what errors call it, `plain` where it lies uncompressed."""
+    """Yield the messages of a SQLite database; `path` is its name in errors, `plain` the uncompressed file."""
     row = before = 0
     try:
         with closing(sqlite3.connect(f"{plain.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:

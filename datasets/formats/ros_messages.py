@@ -207,7 +207,7 @@ class RosExtractor:
         self.codes = [code for leaf in self._leaves.values() for code in leaf.codes]
 
     def __call__(self, data: bytes) -> list[Any]:
-        """Return the numbers, in the order in which they stand in the message."""
+        """Return the numbers, in the order of the message."""
         out: list[Any] = []
         if not self._cdr:
             end = self._steps["<"](data, 0, out)
@@ -288,7 +288,7 @@ class _Plan:
         return leaf.codes, leaf.size, leaf.align
 
     def _indices(self, path: str) -> list[int]:
-        """Return which elements of an array are asked for."""
+        """Return the wanted indices of an array."""
         rests = (w.removeprefix(f"{path}.").partition(".")[0] for w in self.wanted if w.startswith(f"{path}."))
         return sorted({int(rest) for rest in rests if rest.isascii() and rest.isdecimal()})
 
@@ -355,7 +355,7 @@ class _Plan:
         return step
 
     def _sequence(self, path: str, leaf: _Leaf) -> Step:
-        """Return the step over an array of numbers whose length stands in the message."""
+        """Return the step over an array of numbers whose length is in the message."""
         picks = []
         for index in self._indices(path):
             self.leaves[f"{path}.{index}"] = leaf
@@ -416,7 +416,7 @@ def _in_turn(steps: Sequence[Step]) -> Step:
 
 
 def ros_channel(topic: str, kind: str, types: Callable[[], Types], serialisation: Serialisation, where: str) -> Channel:
-    """Return a channel of ROS messages; `types` is asked only when they are read."""
+    """Return a channel of ROS messages; `types` is called only when they are read."""
 
     def fields() -> tuple[str, ...]:
         return numeric_fields(types(), kind, where)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -180,7 +181,7 @@ class Scenario:
         """Angular rate of the Earth, (3,) in W axes; zero where it does not turn."""
         return np.zeros(3) if self.latitude_deg is None else self.rig.w_CW_W
 
-    @property
+    @cached_property
     def rig(self) -> Rig:
         """What the estimators are told of the vehicle."""
         aboard = {sensor: getattr(self, sensor) for sensor in ("depth", "gps", "heading")}
@@ -192,7 +193,7 @@ class Scenario:
             latitude_deg=self.latitude_deg,
         )
 
-    @property
+    @cached_property
     def mountings(self) -> dict[str, Mounting]:
         """Where the IMU and the sensors aboard really sit, by sensor name: the rig's word and their faults."""
         rig = self.rig

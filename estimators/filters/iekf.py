@@ -1,5 +1,7 @@
 """The right-invariant extended Kalman filter with biases ("imperfect": biases stand beside the group).
 
+The equations are docs/conventions.md (39) to (43).
+
 Pose and velocity X = (R_WB, v_WB_W, p_WB_W) are one element of SE_2(3), and the error is on its left, in W:
 
     X_true = Exp(xi) X        xi = (phi, rho, nu), rotation, position, velocity; biases are added, as ever
@@ -43,6 +45,7 @@ from ..physics.imu import integrate, predict, process_noise, sandwich, turns
 from ..physics.measurements import measure
 from ..physics.so3 import cross_into, exp, product, right_jacobian, skew_into, transform, transform_into
 from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
+from ..stages import stage
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 PHI, RHO, NU = THETA, POSITION, VELOCITY
@@ -78,6 +81,7 @@ class InvariantKalman(Kalman):
         """See `Kalman.correct`."""
         return correct_invariant(state, rig, readings, self._origin)
 
+    @stage("marginal")
     def error_covariance(self, state: NDArray[Any]) -> Array:
         """See `Kalman.error_covariance`. (The rate noise that a belief adds to v is the same in nu.)"""
         s = state[0]

@@ -1,4 +1,4 @@
-"""Rauch–Tung–Striebel: the error-state Kalman filter forwards, then backwards over the whole log.
+"""Rauch–Tung–Striebel: the error-state Kalman filter forwards, then backwards; docs/conventions.md (44).
 
 Source: Rauch, Tung & Striebel 1965, doi:10.2514/3.3166, on the manifold. With x_k the filtered state of epoch k, P_k
 its covariance, x⁻ = f(x_k) and P⁻ = F P_k Fᵀ + Q the prediction of epoch k + 1, and S for what is smoothed:
@@ -29,10 +29,12 @@ from ..physics.elimination import divide_into
 from ..physics.imu import BLOCK, predict, process_noise, sandwich
 from ..physics.so3 import inverse_right_jacobian_into
 from ..physics.state import STATE, as_belief, as_record, inject, local, turn_covariance, with_rate_noise
+from ..stages import stage
 from .eskf import ErrorStateKalman
 from .filter_pass import FilterOptions, FilterPass
 
 TRIANGLE = DIM * (DIM + 1) // 2
+"""Numbers in one half of a symmetric matrix."""
 PAGE = 1024
 """Epochs for which memory is taken at a time."""
 
@@ -94,6 +96,7 @@ class RauchTungStriebelPass:
         self._length = 0
         return Trajectory.from_beliefs(beliefs[::-1], lookahead_s=np.inf)
 
+    @stage("output")
     def _remember_epoch(self, epoch: Epoch, state: NDArray[Any], block: NDArray[Any]) -> None:
         """Write an epoch down; where nothing moved since the last one, as the same, later known better."""
         t_ns, tick = epoch.t_ns, epoch.tick

@@ -1,4 +1,4 @@
-"""Gauss–Newton's normal equations on a chain of keyframes, in which each is tied to its neighbours only.
+"""Gauss–Newton's normal equations on a chain of keyframes, each tied to its neighbours; docs/conventions.md (45).
 
 They are block-tridiagonal, 15 × 15, and are eliminated from the oldest keyframe to the newest. In the information form
 that is a block Cholesky; but a tactical IMU knows the motion of 0.2 s to 0.1 mm, a prior the place to metres, and the

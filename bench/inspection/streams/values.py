@@ -139,7 +139,7 @@ def _repeats(channel: Channel, x: Array, good: NDArray[np.bool_], steps: list[Qu
     if count <= expected + 5 * np.sqrt(expected) + STALE_SHARE * len(change) or count < FEWEST_MARKED:
         return []
     message = (
-        f"{count} of {len(x)} {channel.name} readings say exactly what the one before said"
+        f"{count} of {len(x)} {channel.name} readings equal the one before exactly"
         + (f" ({expected:.0f} would by chance)" if expected >= 1 else "")
         + ": they were repeated, not measured, and count twice."
     )

@@ -25,6 +25,7 @@ from .drawing import (
 )
 
 POINTWISE = 0.95
+"""Probability of the dark band, at each time by itself."""
 FITS_A_PANEL = 12
 """So many lines of a legend fit where a sixth panel would be."""
 

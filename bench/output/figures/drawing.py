@@ -29,9 +29,11 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 COLUMN_IN, WIDTH_IN, PAGE_IN = 3.5, 7.16, 8.8
 """One column of a journal's page, both, and its height."""
 TITLE_PT, TEXT_PT = 8, 7
+"""Points: journals ask for at least 6 to 7 in print."""
 LETTER_IN = 0.6 / 72
 """Width of a letter per point of its size, on the safe side."""
 DPI = 300
+"""Of PNG files; journals ask for at least 300."""
 LONGEST = 46
 """A label with more letters than this goes on in another line of the legend."""
 

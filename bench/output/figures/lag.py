@@ -16,6 +16,7 @@ from .drawing import WIDTH_IN, Look, empty_figure, handle, legend_below, logarit
 
 UNITS = {"position": "m", "attitude": "°", "velocity": "m/s"}
 FEWEST_LAGS = 3
+"""With two there is a line, and no curve."""
 
 
 def lag_curve(summary: Sequence[Record]) -> str | None:

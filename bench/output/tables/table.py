@@ -46,6 +46,7 @@ BLOCK_HEADINGS = ("ANEES   \npos", "\natt", "\nvel", "\nbias", "\nall")
 NIS_HEADINGS = {"nis_dvl": "dvl", "nis_depth": "depth", "nis_gps": "gps", "nis_heading": "head"}
 ABSENT = "–"
 CAUSE_WIDTH = 160
+"""Characters of a cause of failure: two lines of most terminals; the store has all of it."""
 
 
 def write_table(rows: pd.DataFrame, path: Path) -> None:

@@ -98,7 +98,7 @@ def test_a_lag_of_nothing_takes_odd_rates_and_counts_what_is_late(name: str) -> 
 
 @pytest.mark.parametrize("name", ON_GTSAM)
 def test_what_any_solver_throws_ends_the_run_as_diverged_with_cause_time_and_variable(name: str) -> None:
-    """Cholesky on the IMU noise of a tactical grade; should it learn to, tell DESIGN."""
+    """Cholesky on the IMU noise of a tactical grade; a wheel on which this fails has learnt to."""
     log = simulate(replace(TACTICAL, duration_s=20.0), seed=1)
     result = run_log(log, create(name, factorization="CHOLESKY"))
     assert result.status == "diverged"
