@@ -15,7 +15,7 @@ test: .venv/dev lint
 	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations 40
 
 timing: .venv/dev
-	$(BIN)/fathom timing
+	$(BIN)/fathom timing budgets
 
 # results/reference/*.csv anew; recorded logs among them where FATHOM_DATA has them
 reference: .venv/core
