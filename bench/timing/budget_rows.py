@@ -33,10 +33,10 @@ from .whole_runs import finished_again_mb, finished_again_s, whole_run
 
 LAGS_S = (3.0, 10.0, 30.0)
 CHEAPER = ({}, {"wildfire": 0.1}, {"wildfire": 0.1, "relinearize": [0.05, 1e3, 0.5, 10.0]})
-"""Settings of `fls`, each cheaper than the one before."""
+"""Settings of `fls`, each cheaper than the one before, in time per keyframe."""
 
 RUNS, WARM_RUNS = 100, 10
-"""By two workers and by one: measured, and done before the clock starts."""
+"""Runs that are measured, by two workers and by one; and runs before them, so that the workers are warm."""
 FACTORS = 5000
 """Factors linearised in a turn: some 50 ms."""
 
@@ -49,7 +49,7 @@ _simulated = cache(_mission)
 
 
 def _stepping(log: Log, name: str, **options: Any) -> Callable[[], Any]:
-    """Return what takes every step of a log."""
+    """Return a call that takes every step of a log."""
     estimator, epochs = create(name, **options), cut(log, score_ticks(log, 1.0)).epochs
 
     def steps() -> Any:
@@ -113,7 +113,7 @@ def window_against_fls(lag_s: float) -> Measured:
 
 
 def harness_against_steps() -> Measured:
-    """Measure all but `eskf`'s steps, from a log of ten minutes in memory to its scores, over those steps."""
+    """Measure all but `eskf`'s steps, from a log of ten minutes in memory to its scores, over these steps."""
     log, estimator, ratios = _simulated(600.0), create("eskf"), []
     warm_up(estimator)
     for _ in range(9):
@@ -135,7 +135,7 @@ def simulation_against_filter() -> Measured:
 
 
 def two_workers_against_one() -> Measured:
-    """Measure how many more of 100 runs two processes do at a time than one does, each having done some before."""
+    """Measure the rate of two worker processes over that of one, on 100 runs, the workers being warm."""
     plan = {
         "name": "workers",
         "description": "Many runs.",
@@ -161,7 +161,7 @@ def two_workers_against_one() -> Measured:
 
 
 def memory_of_an_hour() -> Measured:
-    """Measure the peak memory of opening and running an hour, over that of our imports, by the log's own arrays."""
+    """Measure the peak memory of opening and running an hour, less that of our imports, over the log's own arrays."""
     log = _mission(3600.0)
     imports = (
         "from fathom.bench import run_log; from fathom.datasets import open_log; from fathom.estimators import create"
