@@ -24,6 +24,7 @@ from ..interface import FACTORS, Diverged, Factors, Gate, Inflation
 from ..physics.imu import BLOCK, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
+from ..stages import clock, stage
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,30 @@ class Kalman(ABC):
         return state["P"][0]
 
 
+class StagedKalman(Kalman):
+    """A filter whose steps are timed by stage."""
+
+    def __init__(self, kalman: Kalman) -> None:
+        self._kalman = kalman
+
+    @stage("propagation")
+    def predict(
+        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
+    ) -> None:
+        """See `Kalman.predict`."""
+        self._kalman.predict(state, rig, before, imu, block)
+
+    @stage("solve")
+    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
+        """See `Kalman.correct`."""
+        return self._kalman.correct(state, rig, readings)
+
+    @stage("marginal")
+    def error_covariance(self, state: NDArray[Any]) -> Array:
+        """See `Kalman.error_covariance`."""
+        return self._kalman.error_covariance(state)
+
+
 class Lived(NamedTuple):
     """An epoch that has been lived through, the state and the sample before it, and what the gates left out of it."""
 
@@ -102,7 +127,7 @@ class FilterPass:
     ) -> None:
         self.counts: Counter[str] = Counter({f"outliers_{sensor}": 0 for sensor in config.gate})
         self._config = config
-        self._kalman = kalman
+        self._kalman = StagedKalman(kalman) if clock.running else kalman
         self._lived = lived
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._widths = gate_widths(config.gate) if config.gate else None

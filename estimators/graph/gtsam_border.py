@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
-from ..interface import Diverged
-from ..physics.blocks import identity, rows_times, set_block
+from ..interface import Diverged, unknown_kind
+from ..physics.blocks import TOP, identity, rows_times, set_block
 from ..physics.compiled import compiled, inner
 from ..physics.dvl_preintegration import given_rotation
 from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
@@ -187,7 +187,7 @@ def _linearise(
     identity(F)
     if carried:
         predict(block, state, rig[0].gravity, F, state)
-    n = measure(reading, 0, state, rig, r, H, C)
+    n = measure(reading, TOP, state, rig, r, H, C)
     rows_times(n, H, F, H_i)
     H_x, H_v, H_b = _by_gtsam(n, H_i, pose, R_BI)
     return r[:n].copy(), H_x, H_v, H_b
@@ -200,7 +200,7 @@ def _carried_covariance(reading: NDArray[Any], block: NDArray[Any], state: NDArr
     r, H, HQ, C = np.empty(3), np.empty((3, DIM)), np.empty((3, DIM)), np.empty((3, 3))
     predict(block, state, rig[0].gravity, F, end)
     process_noise(block, state[0].R_WB[:], Q)
-    n = measure(reading, 0, end, rig, r, H, C)
+    n = measure(reading, TOP, end, rig, r, H, C)
     rows_times(n, H, Q, HQ)
     cov = np.empty((n, n))
     for i in range(n):
@@ -225,7 +225,7 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
     """
     row, g = reading[0], rig[0]
     if not 0 <= row["kind"] < len(SENSOR):
-        raise ValueError(f"a reading of unknown kind {row['kind']}; the kinds are 0 to {len(SENSOR) - 1}")
+        raise unknown_kind(row["kind"])
     sigma = row["sigma"] * g["inflate"][row["kind"]]
     if row["kind"] == DEPTH:
         model = gtsam.noiseModel.Diagonal.Sigmas(np.array([np.inf, np.inf, sigma[0]]))
@@ -304,7 +304,7 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
     identity(R_BI)  # biases are not involved
     (R_i, p_i), (_, p_j) = _split_pose(pose_i), _split_pose(pose_j)
     r = preintegrated_dvl_residual(R_i, p_i, p_j, dp_ij, H_i, H_j)
-    return r, _by_gtsam(3, H_i, pose_i, R_BI)[0], _by_gtsam(3, H_j, pose_j, R_BI)[0]
+    return r, _by_gtsam(len(H_i), H_i, pose_i, R_BI)[0], _by_gtsam(len(H_j), H_j, pose_j, R_BI)[0]
 
 
 @stage("linearisation")
@@ -333,8 +333,8 @@ def _linearise_tight_displacement(
         for j in range(3):
             b_g[i] += R_BI[j, i] * bias[OF_GYRO + j]
     r = tight_dvl_residual(R_i, p_i, b_g, R_j, p_j, displacement, K, H_i, H_j)
-    H_x, _, H_b = _by_gtsam(3, H_i, pose_i, R_BI)
-    return r, H_x, _by_gtsam(3, H_j, pose_j, R_BI)[0], H_b
+    H_x, _, H_b = _by_gtsam(len(H_i), H_i, pose_i, R_BI)
+    return r, H_x, _by_gtsam(len(H_j), H_j, pose_j, R_BI)[0], H_b
 
 
 @stage("linearisation")
@@ -372,7 +372,7 @@ def _linearise_prior(
     identity(H)
     inverse_right_jacobian_into(r[THETA], J)
     set_block(H, THETA_0, THETA_0, 1.0, J)
-    H_x, H_v, H_b = _by_gtsam(DIM, H, pose, R_BI)
+    H_x, H_v, H_b = _by_gtsam(len(H), H, pose, R_BI)
     return r, H_x, H_v, H_b
 
 
