@@ -6,29 +6,31 @@ from collections import Counter
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
 from ..datasets.epochs import ATTITUDE, DEPTH, DVL, HEADING, SENSOR, Epoch
 from ..datasets.rig import Rig
 from ..datasets.state import Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
-from .interface import FACTORS, Factors
+from .interface import FACTORS, Factors, unknown_kind
 from .physics.dvl_preintegration import preintegrate_dvl
 from .physics.imu import compile_rig, over_world
 from .physics.so3 import exp
+from .stages import stage
 
 
 @dataclass(frozen=True)
 class DeadReckoning:
     """No fusion: the DVL's velocity, held between readings, rotated by the attitude and summed.
 
-    An axis that a reading does not measure has no velocity: a wheel says how fast, and the nose says where to.
+    An axis that a reading does not measure is taken to have no velocity, as on a wheeled vehicle.
 
     Attributes:
         attitude: "gyro" integrates the rates from the prior's attitude (its bias removed); "heading" takes the yaw
             of the heading sensor, roll and pitch being level (or all three, from a sensor that gives them).
         factors: "heading" and "depth" may be left out; without "dvl" it stands still.
-        earth_rotation: by "gyro", take the Earth's rate off what the gyro senses; needs the rig's latitude.
+        earth_rotation: with "gyro", subtract the Earth's rate from the gyro's; needs the rig's latitude.
     """
 
     attitude: Literal["gyro", "heading"] = "heading"
@@ -57,18 +59,7 @@ class DeadReckoningPass:
     def step(self, epoch: Epoch) -> None:
         """See `Pass.step`. A reading that comes late is taken as if it were of now, unless a newer one is known."""
         if len(epoch.imu):
-            held_ns = np.array([self._t_ns])
-            rate_bias = self._prior.b_g
-            imu = over_world(epoch.imu, self._R_WB, rate_bias, self._records)
-            if self._config.attitude == "heading":  # nothing turns between two headings
-                imu = imu.copy()
-                imu["w_WI_I"] = rate_bias
-            displacement = preintegrate_dvl(
-                imu, self._t_ns, held_ns, self._v_WB_B[None], np.zeros((1, 3)), rate_bias, self._records, False
-            )
-            self._p_WB_W = self._p_WB_W + self._R_WB @ displacement["dp"][0]
-            if self._config.attitude == "gyro":
-                self._R_WB = self._R_WB @ displacement["dR"][0]
+            self._propagate(epoch.imu)
         for reading in epoch.readings:
             self._take(reading)
         self._t_ns = epoch.t_ns
@@ -79,11 +70,29 @@ class DeadReckoningPass:
         return Belief(self._t_ns, state, np.full((15, 15), np.nan))
 
     def finish(self) -> Trajectory | None:
-        """It has no hindsight."""
+        """Dead reckoning has no smoothed states."""
         return None
 
+    @stage("propagation")
+    def _propagate(self, samples: NDArray[Any]) -> None:
+        held_ns = np.array([self._t_ns])
+        rate_bias = self._prior.b_g
+        imu = over_world(samples, self._R_WB, rate_bias, self._records)
+        if self._config.attitude == "heading":  # nothing turns between two headings
+            imu = imu.copy()
+            imu["w_WI_I"] = rate_bias
+        displacement = preintegrate_dvl(
+            imu, self._t_ns, held_ns, self._v_WB_B[None], np.zeros((1, 3)), rate_bias, self._records, False
+        )
+        self._p_WB_W = self._p_WB_W + self._R_WB @ displacement["dp"][0]
+        if self._config.attitude == "gyro":
+            self._R_WB = self._R_WB @ displacement["dR"][0]
+
+    @stage("solve")
     def _take(self, reading: Any) -> None:
         kind, z = int(reading["kind"]), reading["z"]
+        if not 0 <= kind < len(SENSOR):
+            raise unknown_kind(kind)
         if SENSOR[kind] not in self._config.factors or np.isinf(reading["sigma"]).all():
             return
         if reading["t_ns"] <= self._newest_ns[kind]:

@@ -7,7 +7,7 @@ from typing import Annotated, Protocol, TypeVar, runtime_checkable
 
 from pydantic import AfterValidator, Field
 
-from ..datasets.epochs import Epoch
+from ..datasets.epochs import SENSOR, Epoch
 from ..datasets.errors import nearest
 from ..datasets.rig import Rig
 from ..datasets.state import Belief
@@ -39,11 +39,17 @@ Inflation = Annotated[
 ]
 """Factor on the stated sigma by sensor; also "gyro" and "accel"."""
 Gate = Annotated[dict[str, Annotated[float, Field(gt=0, lt=1)]], sensors_among(FACTORS)]
-"""Probability by sensor: a reading that an honest filter would find less likely than all but this share is left out."""
+"""Probability by sensor: a reading is left out if its NIS exceeds the chi-square quantile of this probability."""
+
+
+def unknown_kind(kind: int) -> ValueError:
+    """Return the error for a reading of a kind that no sensor of ours has."""
+    known = ", ".join(f"{k} {sensor}" for k, sensor in enumerate(SENSOR))
+    return ValueError(f"a reading of unknown kind {kind} (known: {known})")
 
 
 class Diverged(RuntimeError):  # noqa: N818 - the run's status, by its name
-    """The estimator cannot go on: numbers that are not finite, a covariance that is none, a solver that gave up.
+    """The estimator cannot go on: numbers not finite, a covariance not positive definite, a solver that gave up.
 
     The run is recorded as diverged, with this message as its cause.
     """
@@ -70,7 +76,7 @@ class Pass(Protocol):
         ...
 
     def finish(self) -> Trajectory | None:
-        """Return the states with hindsight, at the ticks; None for an estimator that has none."""
+        """Return the smoothed states at the ticks; None for an estimator that only filters."""
         ...
 
 

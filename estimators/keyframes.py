@@ -20,11 +20,12 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from ..datasets.epochs import DVL, READING, SENSOR
 from ..datasets.state import TimeArray
+from .interface import unknown_kind
+from .physics.compiled import compiled, inner
 from .smoothers import GraphSmoother
 
 LONGEST_SILENCE_S = 1.0
@@ -33,7 +34,7 @@ LEAST_AGE_NS = 500_000
 """A keyframe of just the window's age stays, for it has yet to see the new one; this allows for rounding of lag_s."""
 NO_READINGS = np.zeros(0, READING)
 
-KEYFRAME, AT_KEYFRAME, CARRIED, SUMMED, SOLVE = range(5)
+KEYFRAME, AT_KEYFRAME, CARRIED, SUMMED, SOLVE = np.arange(5)  # no literals, for which numba would compile anew
 """What an order, a row (what, keyframe, x), asks for:
 
     KEYFRAME        make this keyframe, at time x, and close the interval before it
@@ -139,8 +140,7 @@ class Keyframes:
             if n >= 0:
                 return self._orders[:n]
             if n == UNKNOWN_KIND:
-                known = ", ".join(f"{kind} {sensor}" for kind, sensor in enumerate(SENSOR))
-                raise ValueError(f"a reading of unknown kind, one of {readings['kind'].tolist()}; known: {known}")
+                raise unknown_kind(next(kind for kind in readings["kind"].tolist() if not 0 <= kind < len(SENSOR)))
             self._make_room()
 
     def _make_room(self) -> None:
@@ -154,7 +154,7 @@ class Keyframes:
         self._orders = np.zeros((2 * len(self._orders), 3), np.int64)
 
 
-@njit(cache=True)
+@compiled
 def decide(
     plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], roles: NDArray[np.int64], orders: NDArray[np.int64],
     readings: NDArray[Any], now_ns: int, closing: bool,
@@ -197,7 +197,7 @@ def decide(
     return p.orders
 
 
-@njit(cache=True)
+@inner
 def order(plan: NDArray[Any], orders: NDArray[np.int64], what: int, keyframe: int, x: int) -> None:
     """Write an order down."""
     n = plan[0].orders
@@ -205,7 +205,7 @@ def order(plan: NDArray[Any], orders: NDArray[np.int64], what: int, keyframe: in
     plan[0].orders = n + 1
 
 
-@njit(cache=True)
+@inner
 def throw_away(plan: NDArray[Any], rows: NDArray[Any], roles: NDArray[np.int64]) -> None:
     """Drop the rows that are not needed any more; the others keep their order."""
     kept = 0
@@ -217,7 +217,7 @@ def throw_away(plan: NDArray[Any], rows: NDArray[Any], roles: NDArray[np.int64])
     plan[0].rows = kept
 
 
-@njit(cache=True)
+@inner
 def receive(
     plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], roles: NDArray[np.int64], orders: NDArray[np.int64],
     readings: NDArray[Any],
@@ -252,7 +252,7 @@ def receive(
                 place(plan, times, rows, orders, k, row)
 
 
-@njit(cache=True)
+@inner
 def place(
     plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], orders: NDArray[np.int64], k: int, row: int
 ) -> None:
@@ -266,7 +266,7 @@ def place(
         order(plan, orders, AT_KEYFRAME, k, row)
 
 
-@njit(cache=True)
+@inner
 def makes_keyframe(now_ns: int, plan: NDArray[Any], times: TimeArray, kind: int, t_ns: int) -> bool:
     """Whether a reading that has just come makes a keyframe."""
     p = plan[0]
@@ -279,7 +279,7 @@ def makes_keyframe(now_ns: int, plan: NDArray[Any], times: TimeArray, kind: int,
     return dvl_is_silent and since_ns >= max(p.period_ns, p.timeout_ns) - p.merge_ns
 
 
-@njit(cache=True)
+@inner
 def close(
     plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], roles: NDArray[np.int64], orders: NDArray[np.int64],
     t_ns: int,
@@ -322,7 +322,7 @@ def close(
     order(plan, orders, SOLVE, new, p.oldest)
 
 
-@njit(cache=True)
+@inner
 def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], first: int) -> None:
     """Bring the readings to sum behind the others, in the order of their times; all else keeps its order."""
     for k in range(first + 1, plan[0].orders):
@@ -339,7 +339,7 @@ def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], 
         orders[j, 0], orders[j, 1], orders[j, 2] = what, keyframe, row
 
 
-@njit(cache=True)
+@inner
 def place_one_by_one(
     plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], orders: NDArray[np.int64], first: int, end_ns: int
 ) -> None:

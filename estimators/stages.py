@@ -35,7 +35,7 @@ class StageClock:
         self._since_ns = 0
 
     def start(self) -> None:
-        """Set every stage to 0, and time from now on."""
+        """Set every stage to 0, and time from now on. Passes that are timed begin after this."""
         self._ns, self._entered, self.running = dict.fromkeys(STAGES, 0), [], True
         self.calls.clear()
 

@@ -39,7 +39,7 @@ def compile_cpu_seconds(names: Sequence[str]) -> Compiling:
     """
     with (
         tempfile.TemporaryDirectory(prefix="fathom-compiling-") as folder,
-        start(f"{__name__}:measure", *names, environment={"NUMBA_CACHE_DIR": folder}) as child,
+        start(f"{__spec__.name}:measure", *names, environment={"NUMBA_CACHE_DIR": folder}) as child,
     ):
         return child.connection.recv()
 

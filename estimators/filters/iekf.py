@@ -122,19 +122,19 @@ def propagate_invariant(
 ) -> None:
     """x ← f(x, imu), P ← Φ P Φᵀ + A Q Aᵀ, with A = `to_invariant` at the end."""
     s, F, Q, none = state[0], np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.zeros((DIM, DIM))
-    back = from_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
-    integrate(imu, before, s.b_a, s.b_g, rig, block)
-    process_noise(block, s.R_WB, Q)
+    back = from_invariant(s.R_WB[:], s.p_WB_W - origin, s.v_WB_W[:])
+    integrate(imu, before, s.b_a[:], s.b_g[:], rig, block)
+    process_noise(block, s.R_WB[:], Q)
     predict(block, state, rig[0].gravity, F, state)
-    A = to_invariant(s.R_WB, s.p_WB_W - origin, s.v_WB_W)
-    if turns(block[0].w_CW_W):
+    A = to_invariant(s.R_WB[:], s.p_WB_W - origin, s.v_WB_W[:])
+    if turns(block[0].w_CW_W[:]):
         Phi, AF = np.zeros((DIM, DIM)), np.zeros((DIM, DIM))
         add_product(A, F, AF)
         add_product(AF, back, Phi)
     else:
         Phi = invariant_transition(block, rig[0].gravity, F, A)
     sandwich(A, Q, none, Q)
-    sandwich(Phi, s.P, Q, s.P)
+    sandwich(Phi, s.P[:], Q, s.P[:])
 
 
 @inner
@@ -179,19 +179,19 @@ def correct_invariant(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[
     H by the invariant error is H · `from_invariant`: for a DVL (0, 0, R_BW).
     """
     s, dx, r, H, C = state[0], np.zeros(DIM), np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
-    by_phi, p_OB_W, v_WB_W = np.empty((3, 3)), s.p_WB_W - origin, s.v_WB_W
+    by_phi, p_OB_W, v_WB_W = np.empty((3, 3)), s.p_WB_W - origin, s.v_WB_W[:]
     for m in range(len(readings)):
         n = measure(readings, m, state, rig, r, H, C)
         for row in range(n):
-            transform_into(s.R_WB, H[row, THETA], by_phi[0])
+            transform_into(s.R_WB[:], H[row, THETA], by_phi[0])
             cross_into(p_OB_W, H[row, POSITION], by_phi[1])
             cross_into(v_WB_W, H[row, VELOCITY], by_phi[2])
             for i in range(3):
                 H[row, PHI_0 + i] = by_phi[0, i] + by_phi[1, i] + by_phi[2, i]
-        if not absorb(n, r, H, C, dx, s.P):
+        if not absorb(n, r, H, C, dx, s.P[:]):
             return False
     inject_invariant(state, dx, origin)
-    symmetrise(s.P)
+    symmetrise(s.P[:])
     return np.isfinite(dx.sum())
 
 
@@ -200,7 +200,7 @@ def inject_invariant(state: NDArray[Any], dx: Array, origin: Array) -> None:
     """X ← Exp(xi) X: R ← Exp(phi) R, v ← Exp(phi) v + J_l(phi) nu, p likewise about the origin."""
     s = state[0]
     turn, J_l = exp(dx[PHI]), right_jacobian(-dx[PHI])
-    R_WB, p, v = product(turn, s.R_WB), transform(turn, s.p_WB_W - origin), transform(turn, s.v_WB_W)
+    R_WB, p, v = product(turn, s.R_WB[:]), transform(turn, s.p_WB_W - origin), transform(turn, s.v_WB_W[:])
     moved, gained = transform(J_l, dx[RHO]), transform(J_l, dx[NU])
     for i in range(3):
         for j in range(3):

@@ -195,9 +195,9 @@ def smooth_one(
     """Smooth `now`, in place, given the smoothed state `later` and the block between; `ahead` is scratch."""
     F, Q, P_ahead = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty((DIM, DIM))
     FP, Gt, J, d = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty((3, 3)), np.empty(DIM)
-    P, gained = now[0].P, later[0].P.copy()
+    P, gained = now[0].P[:], later[0].P.copy()
     predict(block, now, gravity, F, ahead)
-    process_noise(block, now[0].R_WB, Q)
+    process_noise(block, now[0].R_WB[:], Q)
     sandwich(F, P, Q, P_ahead)
 
     local(ahead, later, d)

@@ -109,8 +109,8 @@ def carry_points(
     """Carry the state over a block, in place but for P, fill Q, and return the points' errors about it, (n, 15)."""
     F, point, end = np.empty((DIM, DIM)), state.copy(), state.copy()
     errors = np.empty_like(points)
-    integrate(imu, before, state[0].b_a, state[0].b_g, rig, block)
-    process_noise(block, state[0].R_WB, Q)
+    integrate(imu, before, state[0].b_a[:], state[0].b_g[:], rig, block)
+    process_noise(block, state[0].R_WB[:], Q)
     predict(block, state, rig[0].gravity, F, end)
     for k in range(len(points)):
         retract(state, points[k], point)

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.state import Array, TimeArray
-from .blocks import clear, identity, set_product
+from .blocks import clear, identity
 from .compiled import compiled
 from .imu import HELD_RATE, turn_by
 from .so3 import product_into, skew_into, transform_into
@@ -74,6 +74,7 @@ def preintegrate_dvl(
         a bias d is the rotation error −ΔR R_BI dt d at each sample.
     """
     g, n = rig[0], len(t_ns)
+    R_BI = g.R_BI[:]
     capacity = len(imu) + n
     position, turn, q = np.empty((capacity, 3)), np.empty((capacity, 3, 3)), np.empty(capacity)  # piece by piece
     weight = np.zeros((n, 3, 3))  # Σ ΔR Δt by reading
@@ -86,7 +87,7 @@ def preintegrate_dvl(
         sample = imu[row]
         for i in range(3):
             w_I[i] = sample.w_WI_I[i] - b_g[i]
-        transform_into(g.R_BI, w_I, w)
+        transform_into(R_BI, w_I, w)
         while now_ns < sample.t_ns:
             while k + 1 < n and t_ns[k + 1] <= now_ns:
                 k += 1
@@ -121,7 +122,7 @@ def preintegrate_dvl(
     out = np.empty(1, DISPLACEMENT)
     d = out[0]
     turned, u_turned, N_pp, S = matrices[2], matrices[3], matrices[4], matrices[5]  # Σ dt ΔR and Σ dt [u]× ΔR
-    N, qu, q_sum = d.N, w, 0.0  # Σ q u and Σ q
+    N, qu, q_sum = d.N[:], w, 0.0  # Σ q u and Σ q
     for k in range(n):
         for i in range(3):
             for j in range(3):
@@ -144,9 +145,9 @@ def preintegrate_dvl(
                 N_pp[i, j] -= q[m] * u[i] * u[j]
         q_sum += q[m]
 
-    product_into(turned, g.R_BI, S)
+    product_into(turned, R_BI, S)
     clear(N)
-    set_product(d.p_bg, 0, 0, 1.0, u_turned, g.R_BI)
+    product_into(u_turned, R_BI, d.p_bg[:])
     for i in range(3):
         d.dp[i], d.b_g[i] = dp[i], b_g[i]
         for j in range(3):

@@ -143,7 +143,7 @@ def integrate(
     )  # fmt: skip
     identity(R)
     T = 0.0
-    rates, forces, dts = unbiased(imu, before, b_a, b_g, g.R_BI)
+    rates, forces, dts = unbiased(imu, before, b_a, b_g, g.R_BI[:])
     for k in range(n):
         dt = dts[k + 1]
         increments(rates, forces, dts, k, turn, push, drift)
@@ -163,8 +163,8 @@ def integrate(
         product_into(R_mid[k], half, R)
         T += dt
 
-    cross_into(rates[0], g.p_BI_B, c_i)
-    cross_into(rates[n], g.p_BI_B, c_j)
+    cross_into(rates[0], g.p_BI_B[:], c_i)
+    cross_into(rates[n], g.p_BI_B[:], c_j)
     block.T = T
     for i in range(3):  # from I to B: v and p are now of the block's end
         for j in range(3):
@@ -238,7 +238,7 @@ def _spread(
         cov(Δv, Δp) = Σ q [u]× [w]×ᵀ = Σ q (u·w I − w uᵀ),        cov(φ, Δv) = Σ q [u]×,        and so on.
     """
     g, block, n = rig[0], out[0], len(imu)
-    T, N = block.T, block.N
+    T, N, R_BI = block.T, block.N[:], g.R_BI[:]
     matrices, vectors = np.zeros((6, 3, 3)), np.zeros((4, 3))
     turned, lifted = matrices[0], matrices[1]  # Σ dt ΔR and Σ dt (T − s) ΔR
     u_turned, w_turned = matrices[2], matrices[3]  # Σ dt [u]× ΔR and Σ dt [w]× ΔR
@@ -292,9 +292,9 @@ def _spread(
         for j in range(3 * (i // 3)):
             N[i, j] = N[j, i]
 
-    skew_into(g.p_BI_B, S)
-    product_into(S, g.R_BI, L_BI)  # ω = R_BI (w − b_g), and d(ω × l) = [l]× R_BI d
-    product_into(turned, g.R_BI, S)  # from here on S is Σ dt ΔR R_BI
+    skew_into(g.p_BI_B[:], S)
+    product_into(S, R_BI, L_BI)  # ω = R_BI (w − b_g), and d(ω × l) = [l]× R_BI d
+    product_into(turned, R_BI, S)  # from here on S is Σ dt ΔR R_BI
     for i in range(3):
         for j in range(3):
             block.v_ba[i, j] = -S[i, j]
@@ -302,9 +302,9 @@ def _spread(
             block.v_bg[i, j], block.p_bg[i, j] = L_BI[i, j], T * L_BI[i, j]
             for m in range(3):
                 block.R_bg[i, j] -= block.dR[m, i] * S[m, j]
-                block.p_ba[i, j] -= lifted[i, m] * g.R_BI[m, j]
-                block.v_bg[i, j] += u_turned[i, m] * g.R_BI[m, j] - block.dR[i, m] * L_BI[m, j]
-                block.p_bg[i, j] += w_turned[i, m] * g.R_BI[m, j]
+                block.p_ba[i, j] -= lifted[i, m] * R_BI[m, j]
+                block.v_bg[i, j] += u_turned[i, m] * R_BI[m, j] - block.dR[i, m] * L_BI[m, j]
+                block.p_bg[i, j] += w_turned[i, m] * R_BI[m, j]
     block.bias_walk[0], block.bias_walk[1] = g.accel_walk**2 * T, g.gyro_walk**2 * T
 
 
@@ -320,16 +320,16 @@ def predict(block: NDArray[Any], state: NDArray[Any], gravity: float, F: Array, 
         out: STATE record of length 1, filled but for P; may be `state`.
     """
     b, s, e = block[0], state[0], out[0]
-    T, R_i = b.T, s.R_WB
+    T, R_i = b.T, s.R_WB[:]
     vectors, matrices = np.empty((7, 3)), np.empty((4, 3, 3))
     d_a, d_g, phi, dv, dp = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
     p_j, v_j = vectors[5], vectors[6]
     turn, dR, R_j, S = matrices[0], matrices[1], matrices[2], matrices[3]
     for i in range(3):
         d_a[i], d_g[i] = s.b_a[i] - b.b_a[i], s.b_g[i] - b.b_g[i]
-    transform_into(b.R_bg, d_g, phi)
+    transform_into(b.R_bg[:], d_g, phi)
     exp_into(phi, turn)
-    product_into(b.dR, turn, dR)
+    product_into(b.dR[:], turn, dR)
     for i in range(3):
         dv[i], dp[i] = b.dv[i], b.dp[i]
         for j in range(3):
@@ -342,15 +342,15 @@ def predict(block: NDArray[Any], state: NDArray[Any], gravity: float, F: Array, 
             F[THETA_0 + i, THETA_0 + j] = dR[j, i]
         F[POSITION_0 + i, VELOCITY_0 + i] = T
     right_jacobian_into(phi, S)
-    set_product(F, THETA_0, GYRO_BIAS_0, 1.0, S, b.R_bg)
+    set_product(F, THETA_0, GYRO_BIAS_0, 1.0, S, b.R_bg[:])
     skew_into(dp, S)
     set_product(F, POSITION_0, THETA_0, -1.0, R_i, S)
-    set_product(F, POSITION_0, ACCEL_BIAS_0, 1.0, R_i, b.p_ba)
-    set_product(F, POSITION_0, GYRO_BIAS_0, 1.0, R_i, b.p_bg)
+    set_product(F, POSITION_0, ACCEL_BIAS_0, 1.0, R_i, b.p_ba[:])
+    set_product(F, POSITION_0, GYRO_BIAS_0, 1.0, R_i, b.p_bg[:])
     skew_into(dv, S)
     set_product(F, VELOCITY_0, THETA_0, -1.0, R_i, S)
-    set_product(F, VELOCITY_0, ACCEL_BIAS_0, 1.0, R_i, b.v_ba)
-    set_product(F, VELOCITY_0, GYRO_BIAS_0, 1.0, R_i, b.v_bg)
+    set_product(F, VELOCITY_0, ACCEL_BIAS_0, 1.0, R_i, b.v_ba[:])
+    set_product(F, VELOCITY_0, GYRO_BIAS_0, 1.0, R_i, b.v_bg[:])
 
     product_into(R_i, dR, R_j)
     transform_into(R_i, dp, p_j)
@@ -360,8 +360,8 @@ def predict(block: NDArray[Any], state: NDArray[Any], gravity: float, F: Array, 
         v_j[i] += s.v_WB_W[i]
     p_j[2] -= 0.5 * gravity * T * T
     v_j[2] -= gravity * T
-    if turns(b.w_CW_W):
-        turn_world(b.w_CW_W, T, gravity, s.p_WB_W, R_j, p_j, v_j, F)
+    if turns(b.w_CW_W[:]):
+        turn_world(b.w_CW_W[:], T, gravity, s.p_WB_W[:], R_j, p_j, v_j, F)
     for i in range(3):
         for j in range(3):
             e.R_WB[i, j] = R_j[i, j]
@@ -433,7 +433,8 @@ def over_world(imu: NDArray[Any], R_i: Array, b_g: Array, rig: NDArray[Any]) -> 
         rig: RIG record of length 1.
     """
     g, R, R_mid = rig[0], R_i.copy(), np.empty((3, 3))
-    if not turns(g.w_CW_W):
+    R_BI, w_CW_W = g.R_BI[:], g.w_CW_W[:]
+    if not turns(w_CW_W):
         return imu
     rows, vectors = imu.copy(), np.empty((4, 3))
     w_I, w_B, w_CW_B, w_CW_I = vectors[0], vectors[1], vectors[2], vectors[3]
@@ -441,13 +442,13 @@ def over_world(imu: NDArray[Any], R_i: Array, b_g: Array, rig: NDArray[Any]) -> 
         row = rows[k]
         for i in range(3):
             w_I[i] = row.w_WI_I[i] - b_g[i]
-        transform_into(g.R_BI, w_I, w_B)
+        transform_into(R_BI, w_I, w_B)
         for i in range(3):
             for j in range(3):
                 R_mid[i, j] = R[i, j]
         turn_by(R_mid, w_B, 0.5 * row.dt_s)
-        inverse_transform_into(R_mid, g.w_CW_W, w_CW_B)
-        inverse_transform_into(g.R_BI, w_CW_B, w_CW_I)
+        inverse_transform_into(R_mid, w_CW_W, w_CW_B)
+        inverse_transform_into(R_BI, w_CW_B, w_CW_I)
         for i in range(3):
             row.w_WI_I[i] -= w_CW_I[i]
             w_B[i] -= w_CW_B[i]

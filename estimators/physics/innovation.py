@@ -68,7 +68,7 @@ def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table:
     for m in range(len(readings)):
         n, largest = measure(readings, m, state, rig, r, H, S), 0.0
         for i in range(n):
-            S[i, i] = project(H[i], state[0].P, S[i, i], PH)
+            S[i, i] = project(H[i], state[0].P[:], S[i, i], PH)
             for j in range(DIM):
                 largest = max(largest, abs(H[i, j]))
                 for k in range(i):

@@ -25,7 +25,7 @@ def propagate(
     state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
 ) -> None:
     """x ← f(x, imu), P ← F P Fᵀ + Q; fills `block` with the motion."""
-    integrate(imu, before, state[0].b_a, state[0].b_g, rig, block)
+    integrate(imu, before, state[0].b_a[:], state[0].b_g[:], rig, block)
     carry(block, state, rig[0].gravity)
 
 
@@ -33,9 +33,9 @@ def propagate(
 def carry(block: NDArray[Any], state: NDArray[Any], gravity: float) -> None:
     """Carry a STATE record, with its P, over a BLOCK, in place."""
     F, Q = np.empty((DIM, DIM)), np.empty((DIM, DIM))
-    process_noise(block, state[0].R_WB, Q)
+    process_noise(block, state[0].R_WB[:], Q)
     predict(block, state, gravity, F, state)
-    sandwich(F, state[0].P, Q, state[0].P)
+    sandwich(F, state[0].P[:], Q, state[0].P[:])
 
 
 @compiled
@@ -44,7 +44,7 @@ def correct(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> b
     dx, r, H, C = np.zeros(DIM), np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
     for m in range(len(readings)):
         n = measure(readings, m, state, rig, r, H, C)
-        if not absorb(n, r, H, C, dx, state[0].P):
+        if not absorb(n, r, H, C, dx, state[0].P[:]):
             return False
     inject(state, dx)
     total = 0.0

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
 from ...datasets.state import Array
-from .blocks import clear, set_block, set_product
+from .blocks import TOP, clear, set_block, set_product
 from .compiled import compiled, inner
 from .so3 import (
     between,
     exp,
     inverse_right_jacobian,
+    inverse_right_jacobian_into,
     inverse_transform_into,
     log,
     log_into,
@@ -43,7 +44,7 @@ def position_residual(R_WB: Array, p_WB_W: Array, p_BS_B: Array, p_WS_W: Array, 
     S = np.empty((3, 3))
     skew_into(p_BS_B, S)
     clear(H)
-    set_product(H, 0, THETA_0, -1.0, R_WB, S)
+    set_product(H, TOP, THETA_0, -1.0, R_WB, S)
     transform_into(R_WB, p_BS_B, r)
     for i in range(3):
         H[i, POSITION_0 + i] = 1.0
@@ -78,7 +79,8 @@ def attitude_residual(R_WB: Array, R_BH: Array, R_WH: Array, r: Array, H: Array)
     product_into(R_BH, R_HB, missed)
     log_into(missed, r)
     clear(H)
-    set_block(H, 0, THETA_0, 1.0, inverse_right_jacobian(r))
+    inverse_right_jacobian_into(r, R_HB)
+    set_block(H, TOP, THETA_0, 1.0, R_HB)
 
 
 @inner
@@ -89,7 +91,8 @@ def yaw_residual(R_WB: Array, R_BH: Array, yaw_rad: float, r: Array, H: Array) -
     pitch. Within 2° of its x axis being vertical a yaw says nothing: r and H are zero there. Fills row 0 of r, rad, and
     of H.
     """
-    R_WH = product(R_WB, R_BH)
+    R_WH = np.empty((3, 3))
+    product_into(R_WB, R_BH, R_WH)
     # cos θ sin φ = R[2,1], cos θ cos φ = R[2,2], and cos² θ = R[0,0]² + R[1,0]²
     cos2 = R_WH[0, 0] ** 2 + R_WH[1, 0] ** 2
     clear(H)
@@ -123,12 +126,14 @@ def preintegrated_dvl_residual(R_i: Array, p_i: Array, p_j: Array, dp_ij: Array,
 
     Returns r (3,) m and fills H_i and H_j, both (3, 15).
     """
-    r, S = np.empty(3), np.empty((3, 3))
-    inverse_transform_into(R_i, p_j - p_i, r)
+    r, p_ij_W, S = np.empty(3), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        p_ij_W[i] = p_j[i] - p_i[i]
+    inverse_transform_into(R_i, p_ij_W, r)
     skew_into(r, S)
     clear(H_i)
     clear(H_j)
-    set_block(H_i, 0, THETA_0, 1.0, S)
+    set_block(H_i, TOP, THETA_0, 1.0, S)
     for i in range(3):
         r[i] -= dp_ij[i]
         for j in range(3):
@@ -164,12 +169,14 @@ def tight_dvl_residual(
         r (3,) m.
     """
     d = displacement[0]
-    dp, phi, d_g, moved = np.empty(3), np.empty(3), b_g - d.b_g, np.empty((3, 3))
-    transform_into(d.R_bg, d_g, phi)
-    transform_into(d.p_bg, d_g, dp)
+    dp, phi, d_g, moved = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        d_g[i] = b_g[i] - d.b_g[i]
+    transform_into(d.R_bg[:], d_g, phi)
+    transform_into(d.p_bg[:], d_g, dp)
     for i in range(3):
         dp[i] += d.dp[i]
-    dR = product(d.dR, exp(phi))
+    dR = product(d.dR[:], exp(phi))
     r = preintegrated_dvl_residual(R_i, p_i, p_j, dp, H_i, H_j)
     R_ij = between(R_i, R_j)
     missed = np.empty((3, 3))  # R_ij ΔRᵀ
@@ -179,9 +186,9 @@ def tight_dvl_residual(
     r_R = log(missed)
     K_J = product(K, inverse_right_jacobian(r_R))
     K_J_dR = product(K_J, dR)
-    set_block(H_j, 0, THETA_0, -1.0, K_J_dR)
-    product_into(right_jacobian(phi), d.R_bg, moved)
-    set_product(H_i, 0, GYRO_BIAS_0, 1.0, K_J_dR, moved)
+    set_block(H_j, TOP, THETA_0, -1.0, K_J_dR)
+    product_into(right_jacobian(phi), d.R_bg[:], moved)
+    set_product(H_i, TOP, GYRO_BIAS_0, 1.0, K_J_dR, moved)
     for i in range(3):
         for j in range(3):
             H_i[i, GYRO_BIAS_0 + j] -= d.p_bg[i, j]
@@ -207,20 +214,20 @@ def measure(
         n, how many rows there are; 0 for a sensor that is switched off.
     """
     reading, s, g = readings[m], state[0], rig[0]
-    kind, R_WB = reading.kind, s.R_WB
+    kind, R_WB, z = reading.kind, s.R_WB[:], reading.z[:]
     width = 3
     if kind == DVL:
-        dvl_residual(R_WB, s.v_WB_W, reading.z, r, H)
+        dvl_residual(R_WB, s.v_WB_W[:], z, r, H)
     elif kind == DEPTH:
         width = 1
-        depth_residual(R_WB, s.p_WB_W, g.p_BP_B, reading.z[0], r, H)
+        depth_residual(R_WB, s.p_WB_W[:], g.p_BP_B[:], z[0], r, H)
     elif kind == GPS:
-        position_residual(R_WB, s.p_WB_W, g.p_BG_B, reading.z, r, H)
+        position_residual(R_WB, s.p_WB_W[:], g.p_BG_B[:], z, r, H)
     elif kind == HEADING:
         width = 1
-        yaw_residual(R_WB, g.R_BH, reading.z[0], r, H)
+        yaw_residual(R_WB, g.R_BH[:], z[0], r, H)
     elif kind == ATTITUDE:
-        attitude_residual(R_WB, g.R_BH, reading.z, r, H)
+        attitude_residual(R_WB, g.R_BH[:], z, r, H)
     else:
         width = 0
     n = 0  # rows that are measured; row i becomes row n

@@ -1,8 +1,10 @@
 """The state in compiled code: its record, ⊕ and ⊖, and how a covariance follows its state into a new tangent.
 
 A STATE record is a `NavState` with the covariance P of its error. Compiled code is given an array of length 1, for a
-record taken out of an array does not keep it alive. `NavState.retract` and `NavState.local` define ⊕ and ⊖; those here
-are the same, compiled.
+record taken out of an array does not keep it alive. What a record holds is handed on as a view, `s.P[:]`: without the
+colon its type would be another, and the function compiled once more.
+
+`NavState.retract` and `NavState.local` define ⊕ and ⊖; those here are the same, compiled.
 """
 
 from __future__ import annotations
@@ -26,10 +28,11 @@ from ...datasets.state import (
 from .compiled import compiled, inner
 from .so3 import between_into, exp_into, log_into, product_into, right_jacobian_into
 
-THETA_0, POSITION_0, VELOCITY_0 = THETA.start, POSITION.start, VELOCITY.start
-ACCEL_BIAS_0, GYRO_BIAS_0 = ACCEL_BIAS.start, GYRO_BIAS.start
+THETA_0, POSITION_0, VELOCITY_0, ACCEL_BIAS_0, GYRO_BIAS_0 = (
+    np.int64(part.start) for part in (THETA, POSITION, VELOCITY, ACCEL_BIAS, GYRO_BIAS)
+)
 """Index of each part's first component in the error state, for loops: component i of the position's error is
-`error[POSITION_0 + i]`."""
+`error[POSITION_0 + i]`. To numba a Python integer is a type of its own, and a function compiled once for each."""
 
 STATE = np.dtype(
     [
@@ -71,7 +74,7 @@ def retract(state: NDArray[Any], error: Array, out: NDArray[Any]) -> None:
     s, o = state[0], out[0]
     turn, R_WB = np.empty((3, 3)), np.empty((3, 3))
     exp_into(error[THETA], turn)
-    product_into(s.R_WB, turn, R_WB)
+    product_into(s.R_WB[:], turn, R_WB)
     for i in range(3):
         for j in range(3):
             o.R_WB[i, j] = R_WB[i, j]
@@ -85,7 +88,7 @@ def retract(state: NDArray[Any], error: Array, out: NDArray[Any]) -> None:
 def local(state: NDArray[Any], other: NDArray[Any], error: Array) -> None:
     """Fill the error (15,) with state ⊕ error = other."""
     s, o, turn = state[0], other[0], np.empty((3, 3))
-    between_into(s.R_WB, o.R_WB, turn)
+    between_into(s.R_WB[:], o.R_WB[:], turn)
     log_into(turn, error[THETA])
     for i in range(3):
         error[POSITION_0 + i] = o.p_WB_W[i] - s.p_WB_W[i]
@@ -97,7 +100,7 @@ def local(state: NDArray[Any], other: NDArray[Any], error: Array) -> None:
 @compiled
 def inject(state: NDArray[Any], error: Array) -> None:
     """x ← x ⊕ error, and P ← the covariance of what is left of the error: theta ← J_r(error) (theta − error)."""
-    J, P = np.empty((3, 3)), state[0].P
+    J, P = np.empty((3, 3)), state[0].P[:]
     retract(state, error, state)
     right_jacobian_into(error[THETA], J)
     turn_covariance(P, J)

@@ -1,19 +1,15 @@
 """Gauss–Newton's normal equations on a chain of keyframes, in which each is tied to its neighbours only.
 
-They are block-tridiagonal, 15 × 15, and are eliminated from the oldest keyframe to the newest. In the information form
-that is a block Cholesky; but a tactical IMU knows the motion of 0.2 s to 0.1 mm, a prior the place to metres, and the
-eight digits between them (squared: all sixteen) are lost where one is taken from the other. So each step is written in
-the covariance form, in which the strong tie is a small addend and nothing cancels:
+docs/window.md derives them; equation numbers are those of that page. They are block-tridiagonal, 15 × 15, and are
+eliminated in the covariance form, in which nothing cancels:
 
     δ_j = F δ_i + c + noise of covariance Q                                   a tie from keyframe i to the next, j
     N(m, P)              of δ_i, given all that is older and i's own rows
     N(m_given, P_given)  of δ_j, given the same and the rows of both
-    G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back-substitution
+    G = cov(δ_i, δ_j) P_given⁻¹                       d_i = m + G (d_j − m_given)          the back substitution
 
-It is the elimination that Rauch, Tung & Striebel (doi:10.2514/3.3166) wrote down first. What a state that has left knew
-is then (m_given, P_given) of the next one: marginalising costs nothing. A row is r + H δ (+ H_j δ_j), of unit variance.
-
-Inner loops run along rows of fixed length, so that they compile to vector instructions.
+A row is r + H δ (+ H_j δ_j), of some variance. Inner loops run along rows of fixed length, so that they compile to
+vector instructions.
 """
 
 from __future__ import annotations
@@ -56,7 +52,7 @@ def absorb_joint_row(
     r: float, h_i: Array, h_j: Array, variance: float,
     m_i: Array, P_i: Array, m_j: Array, P_j: Array, P_ji: Array,
 ) -> bool:  # fmt: skip
-    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji being cov(δ_j, δ_i)."""
+    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji = cov(δ_j, δ_i); eq. (5) for a row (3)."""
     PH = np.zeros((2, DIM))
     PH_i, PH_j = PH[0], PH[1]
     for k in range(DIM):
@@ -82,7 +78,7 @@ def absorb_joint_row(
 
 @compiled
 def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j: Array, P_ji: Array) -> None:
-    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P and P_j = F P Fᵀ + Q."""
+    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P, P_j = F P Fᵀ + Q; eq. (6)."""
     P_ij = np.empty((DIM, DIM))
     clear(P_ji)
     for a in range(DIM):
@@ -104,7 +100,7 @@ def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j:
 
 @compiled
 def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
-    """Fill the increments d of keyframes low to newest."""
+    """Fill the increments d of keyframes low to newest; eq. (8)."""
     mask, x = len(nodes) - 1, np.empty(DIM)
     last = nodes[newest & mask]
     for i in range(DIM):
@@ -127,17 +123,17 @@ def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
 
 @compiled
 def smooth_covariances(nodes: NDArray[Any], low: int, newest: int) -> None:
-    """Fill P_smoothed, the covariance of δ given all there is, of keyframes newest down to low."""
+    """Fill P_smoothed, the covariance of δ given all there is, of keyframes newest down to low; eq. (9)."""
     mask, gained = len(nodes) - 1, np.empty((DIM, DIM))
-    copy_into(nodes[newest & mask].P, nodes[newest & mask].P_smoothed)
+    copy_into(nodes[newest & mask].P[:], nodes[newest & mask].P_smoothed[:])
     for k in range(newest - 1, low - 1, -1):
         node, ahead = nodes[k & mask], nodes[(k + 1) & mask]
-        Gt, P, P_ahead, P_given = node.Gt, node.P_smoothed, ahead.P_smoothed, ahead.P_given
+        Gt, P, P_ahead, P_given = node.Gt[:], node.P_smoothed[:], ahead.P_smoothed[:], ahead.P_given[:]
         clear(gained)
         for a in range(DIM):
             for b in range(DIM):
                 add_scaled(gained[a], P_ahead[a, b] - P_given[a, b], Gt[b])
-        copy_into(node.P, P)
+        copy_into(node.P[:], P)
         for i in range(DIM):
             for a in range(DIM):
                 add_scaled(P[i], Gt[a, i], gained[a])

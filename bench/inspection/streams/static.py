@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.log import Log
+from ....datasets.rig import EARTH_RATE_RADPS
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
 from ..findings.look import AXIS_COLOURS, thinned
@@ -27,7 +28,6 @@ TURNED_RAD = DEGREE
 """From the first quarter of a stretch to its last."""
 SHORTEST_S = 5.0
 SIGMAS = 4.0
-EARTH_RAD_S = 7.3e-5
 
 
 class Rest(NamedTuple):
@@ -167,7 +167,7 @@ def _bias(log: Log, bias: Array, total_s: float) -> list[Finding]:
     noise = log.rig.imu_noise
     largest = float(np.abs(bias).max())
     chance = noise.gyro_density / np.sqrt(total_s)
-    if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RAD_S:
+    if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RATE_RADPS:
         return []
     says = (
         "At rest the gyro reads ({:.4g}, {:.4g}, {:.4g}) rad/s".format(*bias)
