@@ -8,13 +8,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from ..datasets.errors import complaints, nearest, not_loaded
+from .batch import BatchSmoother
 from .dead_reckoning import DeadReckoning
 from .filters.eskf import ErrorStateKalmanFilter
 from .filters.eskf_filterpy import FilterpyKalmanFilter
 from .filters.iekf import InvariantKalmanFilter
 from .filters.rts import RauchTungStriebelSmoother
 from .filters.ukf import UnscentedKalmanFilter
-from .graph.smoothers import BatchFixedLagSmoother, BatchSmoother, FixedLagSmoother, WholeLogSmoother
+from .graph.smoothers import BatchFixedLagSmoother, FixedLagSmoother, WholeLogSmoother
 from .interface import Estimator
 from .window.smoother import WindowSmoother
 

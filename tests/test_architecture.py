@@ -24,7 +24,7 @@ TOP = ROOT / "bench" / "fathom"
 MOST_MODULES = 16
 """In one folder; more cannot be taken in at a glance."""
 MOST_FLOORS = 10
-FRONTS = {"estimators.registry", "bench.output.present"}
+FRONTS = {"estimators.registry", "estimators.batch", "bench.output.present"}
 """Modules that gather a folder and those below it, as `__init__` does: a floor of their own, above both."""
 
 

@@ -139,8 +139,8 @@ def _remarks(stored: Stored, task: Task) -> Iterator[str]:
         elif then[key] != now.get(key):
             yield f"its spec says {key}: {then[key]!r}, which was taken for {now.get(key)!r}"
     made_by = json.loads(stored.first["versions"] or "{}")
-    if stored.first["identity"] not in (None, identity(stored.spec, task.readings_sha256, made_by)):
-        package = package_of(task.run.estimator.name)
+    package = package_of(task.run.estimator.name)
+    if stored.first["identity"] not in (None, identity(stored.spec, package, task.readings_sha256, made_by)):
         which = "the readings" if task.readings_sha256 else "its spec or versions, as the store has them,"
         which += f" or the version of {package.rpartition(' ')[0]}, now {package}," if package else ""
         yield f"{which} cannot be what it was made from: its identity is another"

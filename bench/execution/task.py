@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...datasets.trajectory import Trajectory
+from ...estimators.registry import package_of
 from ..errors import ExperimentError
 from ..experiment.plan import Experiment, Run
 from ..metrics.scoring import Scoring
@@ -66,7 +67,7 @@ class Task:
     @cached_property
     def identity(self) -> str:
         """The identity of the run, see `identity.identity`."""
-        return identity(self.spec, self.readings_sha256)
+        return identity(self.spec, package_of(self.run.estimator.name), self.readings_sha256)
 
     def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
         """Return what a row says whether the run succeeds or not."""

@@ -14,8 +14,9 @@ from pydantic.dataclasses import dataclass
 from ...datasets.errors import nearest
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import FACTORS, sensors_among
-from ..metrics import Alignment, Dims
+from ..metrics.alignment import Alignment
 from ..metrics.comparison import OVER_SEEDS
+from ..metrics.pose_error import Dims
 from ..metrics.scoring import Scoring
 from .specs import EstimatorSpec, LogSpec
 from .variants import Grid, changed, points

@@ -16,7 +16,8 @@ from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
 from ...estimators.registry import create
-from ..metrics import Alignment, Dims
+from ..metrics.alignment import Alignment
+from ..metrics.pose_error import Dims
 
 
 @dataclass(frozen=True)

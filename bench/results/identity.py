@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from ...estimators.registry import package_of
-
 COMPUTES_WITH = ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas")
 FINAL = ("done", "diverged")
 """Runs that ended so are not repeated; a failed one (its worker died, it was out of time) is."""
@@ -80,15 +78,20 @@ def _update(digest: Any, value: Any) -> None:
         digest.update(repr(value).encode())
 
 
-def identity(spec: Mapping[str, Any], readings_sha256: str | None, made_by: Mapping[str, str] | None = None) -> str:
+def identity(
+    spec: Mapping[str, Any],
+    package: str | None,
+    readings_sha256: str | None,
+    made_by: Mapping[str, str] | None = None,
+) -> str:
     """Return the identity of a run.
 
     Args:
         spec: as `Experiment.spec` gives it.
+        package: name and version of the package that the estimator comes from; None for ours.
         readings_sha256: of a recorded log, or of the recorded path that a simulated one follows; None for any other,
             which its spec determines.
         made_by: `versions` of an earlier day, for the identity that the run would have had then; today's without.
     """
-    package = package_of(spec["estimator"]["name"])
     decides = {"spec": spec, "readings": readings_sha256, "versions": made_by or versions(), "package": package}
     return sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()

@@ -12,10 +12,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from ..metrics import BLOCKS, pooled_rmse
 from ..metrics.consistency import anees_of, pooled_nis
 from ..metrics.floor_ratio import OVER, rmse_over_floor
+from ..metrics.pose_error import pooled_rmse
 from ..metrics.scoring import INNOVATIONS, MEAN, MEDIAN, POOLED
+from ..metrics.state_error import BLOCKS
 
 Record: TypeAlias = dict[str, Any]
 """One row, absent values being None."""

@@ -14,9 +14,8 @@ from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ..interface import Pass
 from ..smoothers import GraphSmoother, LaggedSmoother, NonNegative, Positive
-from ..window.window_pass import Solving, WindowPass
 from .graph_pass import GraphPass
-from .solvers import BatchLagSolver, BatchSolver, IncrementalSolver, Solver, isam2_params
+from .solvers import BatchLagSolver, IncrementalSolver, Solver, isam2_params
 
 
 @dataclass(frozen=True)
@@ -97,31 +96,3 @@ class WholeLogSmoother(IncrementalSmoother):
     def solver(self, R_BI: Array) -> Solver:
         """See `GtsamSmoother.solver`."""
         return IncrementalSolver(self.isam2_params(), R_BI, extra_updates=self.extra_updates)
-
-
-GUESS_KEYFRAMES = 50
-"""Keyframes, 10 s at 5 Hz: how far back `batch` on our own solver relinearises during the log. Only a first guess."""
-
-
-@dataclass(frozen=True)
-class BatchSmoother(WholeLogSmoother):
-    """MAP over the whole log, solved at its end: the most accurate smoother.
-
-    Attributes:
-        engine: "gtsam" runs iSAM2 during the log, then Levenberg–Marquardt from its estimate. "window" is our own
-            solver (docs/window.md): a fixed-lag smoother during the log, then Gauss–Newton over all of it. Both reach
-            the same optimum; "window" takes a hundredth of the time.
-    """
-
-    engine: Literal["gtsam", "window"] = "gtsam"
-
-    def begin(self, prior: Belief, rig: Rig) -> Pass:
-        """See `Estimator.begin`."""
-        if self.engine == "gtsam":
-            return super().begin(prior, rig)
-        solving = Solving(self.relinearize, self.extra_updates, reach=GUESS_KEYFRAMES, to_optimum=True)
-        return WindowPass(self, solving, prior, rig)
-
-    def solver(self, R_BI: Array) -> Solver:
-        """See `GtsamSmoother.solver`."""
-        return BatchSolver(self.isam2_params(), R_BI, self.factorization, self.extra_updates)

@@ -20,8 +20,8 @@ from ...drawing import (
     look_handle,
     title_above,
 )
-from ...metrics import BLOCKS, DOF
 from ...metrics.consistency import Average, anees_of, interval
+from ...metrics.state_error import BLOCKS, DOF
 from ...results.summary import Record, groups
 from ..cells import NEES_OVER_DOF, ONLINE, SMOOTHED, TIME
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...drawing import DASHES, Look
-from ...metrics import BLOCKS
 from ...metrics.consistency import anees_of
+from ...metrics.state_error import BLOCKS
 from ...results.summary import Record, groups
 from ..cells import ONLINE, column, output_and_lag, text
 

@@ -208,8 +208,8 @@ def test_a_folder_that_cannot_be_locked_is_said_plainly(tmp_path: Path, monkeypa
 
 def test_an_identity_hangs_on_everything_and_on_nothing_else() -> None:
     spec = experiment().spec(experiment().runs()[0])
-    assert identity(spec, None) == identity(json.loads(json.dumps(spec)), None)
-    assert identity(spec, None) != identity(spec | {"seed": 2}, None) != identity(spec, "x")
+    assert identity(spec, None, None) == identity(json.loads(json.dumps(spec)), None, None)
+    assert identity(spec, None, None) != identity(spec | {"seed": 2}, None, None) != identity(spec, None, "x")
     log = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
     same = simulate(Scenario(mission="lawnmower", duration_s=20), seed=1)
     assert content_sha256(log) == content_sha256(same)
