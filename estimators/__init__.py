@@ -1,14 +1,14 @@
-"""Filters and smoothers behind one interface, on one copy of the physics.
+"""Estimators: filters and smoothers over one physics, behind one interface.
 
-- `interface`: `Estimator.begin(prior, rig)` returns a `Pass`, stepped epoch by epoch; `registry` names them all.
-- `physics`: rotations, the state, the IMU block, one residual and Jacobian per sensor, elimination; compiled.
-- `alignment`: the belief at the start of a log that states none.
-- `filters`: `eskf`, `eskf-filterpy`, `iekf`, `ukf`, and `rts` on top of `eskf`.
-- `keyframes`: which reading makes a keyframe, decided once for every smoother.
-- `graph`: smoothers on GTSAM, the only folder that imports it; `window`: our own smoother, compiled.
-- `dead_reckoning`: no fusion, to compare with.
-
-They import the types of `datasets`, and nothing of `bench`. Equations: docs/conventions.md.
+physics/            rotations, state, IMU block, measurements, elimination: compiled, written once
+alignment/          the initial state from a log
+interface           `Estimator` and `Pass`; registry: estimators by name; stages: where the time of a step goes
+filters/            Kalman filters, and rts on top of eskf
+smoothers           options of every smoother; robust: losses
+keyframes           which reading makes a keyframe, and where each reading belongs: for every smoother
+between_keyframes   beliefs between keyframes
+window/             the smoother on our own solver (docs/window.md)
+graph/              the smoothers on GTSAM, the only folder that imports gtsam
 """
 
 from .compiled_cache import use_compiled_folder

@@ -1,4 +1,4 @@
-"""What every smoother can be told, whatever solves it: on GTSAM (`graph`) or on our own solver (`window`)."""
+"""Options of every smoother, whatever solves it: on GTSAM (`graph`) or on our own solver (`window`)."""
 
 from __future__ import annotations
 
@@ -28,42 +28,41 @@ def _once(dvl: frozenset[DvlFactor]) -> frozenset[DvlFactor]:
 
 @dataclass(frozen=True)
 class GraphSmoother(ABC):
-    """What every factor-graph smoother can be told; a kind of it says how it solves.
+    """Options of every factor-graph smoother; its DVL factors are docs/conventions.md (4), (6) and (20).
 
-    A DVL reading makes a keyframe, or with keyframe_period_s the first one after that long. Where the DVL is silent for
-    keyframe_timeout_s, the next other reading makes one; where everything is silent, time does, so that no IMU factor
-    spans much more than a second. Between keyframes the belief is carried on and corrected as a filter would; the graph
-    does not see that.
+    Each DVL reading makes a keyframe; with keyframe_period_s, the first DVL reading after that time does. If the DVL is
+    silent for keyframe_timeout_s, the next reading of another sensor makes one. If all sensors are silent, time makes
+    one, so that no IMU factor spans much more than a second. The rules are in `keyframes`. Between keyframes the belief
+    is carried on by the IMU and corrected as in a filter; the graph does not use that.
 
     Attributes:
-        dvl: how DVL readings enter. "velocity": each by its own factor. "preintegrated-loose": summed to a
-            displacement from keyframe to keyframe, turned by the gyro at the bias of the moment, as if the IMU
-            factor had another gyro. "preintegrated-tight": the same displacement given the rotation between the
-            keyframes and the gyro bias, so that with the IMU factor each gyro sample counts once. One of these two
-            at most: over a second they differ little; over 5 s with a consumer's gyro, loose claims to know the
-            attitude too well. With "velocity" beside it, the reading at a keyframe goes by its velocity and the others
-            are summed, so that none is used twice. A reading that comes after its interval was closed goes by its
-            velocity whatever is said here. So does an interval with a reading that leaves an axis unmeasured (wheel
-            speed): as the vehicle turns, what is not known of one axis of B gets into every axis of the sum, and no
-            displacement is known. `not_summed` counts the readings of such intervals, and of those that max_hold_s
-            leaves out.
-        dvl_between: within a preintegrated interval the velocity is held from one reading to the next, or runs
-            straight, up to the reading at the interval's end (which so has a small part in two factors). Held, its
-            covariance knows the DVL's and the gyro's noise but not what is lost by holding: on a vehicle that
-            manoeuvres it claims too much.
-        keyframe_period_s: None for every DVL reading (1 s with a preintegrated factor).
+        dvl: how DVL readings enter. "velocity": one velocity factor for each. "preintegrated-loose": readings
+            are summed to a displacement between keyframes, rotated by the gyro at its current bias, as if that
+            gyro were independent of the IMU factor's. "preintegrated-tight": the same displacement, conditioned on the
+            rotation between the keyframes and on the gyro bias, so that each gyro sample is used once. Name at most one
+            of the two. Over a second they differ little; over 5 s with a consumer-grade gyro, loose is overconfident
+            of attitude. With "velocity" as well, the reading at a keyframe enters by its velocity and the others are
+            summed, so that none is used twice. A reading received after its interval was closed always enters by its
+            velocity. So does every reading of an interval in which one leaves an axis unmeasured (wheel speed): as the
+            vehicle turns, the unknown axis of B spreads over all axes of the sum. `not_summed` counts the readings of
+            such intervals, and of those that max_hold_s excludes.
+        dvl_between: within a preintegrated interval, "held" holds the velocity from one reading to the next; "straight"
+            interpolates linearly, up to the reading at the interval's end (which then has a small part in two factors).
+            The covariance of "held" contains the noise of the DVL and the gyro, not the error of holding: on a vehicle
+            that manoeuvres it is overconfident.
+        keyframe_period_s: None for a keyframe at every DVL reading (1 s with a preintegrated factor).
         keyframe_timeout_s: see above.
-        max_hold_s: an interval with a longer silence of the DVL is not preintegrated; its readings go by velocity.
-        merge_ns: a reading this close to a keyframe is taken as of it, and counted.
-        factors: the sensors it may use.
+        max_hold_s: an interval with a longer silence of the DVL is not preintegrated; its readings enter by velocity.
+        merge_ns: a reading this close to a keyframe is treated as taken at the keyframe, and counted.
+        factors: sensors that may be used.
         inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
-        robust: loss by sensor, "huber", "cauchy" or "tukey", of the widths of `robust`. Every factor of the sensor has
-            it; `outliers_<sensor>` counts the residuals that are beyond the width when their keyframe leaves. A weight
-            is as fresh as the linearisation of its factor, and stays as it is once a neighbour of its keyframe is
-            marginalised out. Tukey and, less so, Cauchy have no single minimum: what lies beyond the width at the
-            first guess, the IMU's prediction, has no pull and is not reconsidered unless others move the estimate. So
-            a vehicle that is lost by more than the width never hears that sensor again.
-        hindsight_covariance_s: period at which states with hindsight keep their covariance.
+        robust: loss by sensor, "huber", "cauchy" or "tukey", with the widths of `robust`. It applies to every factor
+            of the sensor; `outliers_<sensor>` counts the residuals beyond the width when their keyframe leaves. A
+            weight is computed when its factor is linearised, and is fixed once a neighbour of its keyframe has been
+            marginalised out. Tukey's loss and, less so, Cauchy's can have several minima: a reading beyond the width at
+            the first guess, the IMU's prediction, has no weight until other readings move the estimate. So a vehicle
+            whose error exceeds the width never uses that sensor again.
+        hindsight_covariance_s: smoothed states keep their covariance at this period.
         earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
 
@@ -82,7 +81,7 @@ class GraphSmoother(ABC):
     @property
     @abstractmethod
     def window_s(self) -> float:
-        """How long a state is kept before it leaves with what has been learnt of it; infinite for the whole log."""
+        """How long a state is kept and improved before it leaves, s; infinite for the whole log."""
 
     @abstractmethod
     def begin(self, prior: Belief, rig: Rig) -> Pass:
@@ -101,10 +100,10 @@ class GraphSmoother(ABC):
 
 @dataclass(frozen=True)
 class LaggedSmoother(GraphSmoother):
-    """What keeps the last lag_s seconds and marginalises out what is older.
+    """Options of the fixed-lag smoothers: they keep the last lag_s seconds and marginalise out what is older.
 
     Attributes:
-        lag_s: length of the window; 0 keeps the newest keyframe alone, and is a filter.
+        lag_s: length of the window; with 0 it keeps the newest keyframe only, and is a filter.
     """
 
     lag_s: NonNegative = 3.0

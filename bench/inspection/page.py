@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from warnings import catch_warnings, filterwarnings
 
 from ...datasets.errors import DatasetError
-from ..output.figures.drawing import empty_figure
+from ..drawing import empty_figure
 from .inspecting import Inspection
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
 from ..execution.sweep import run_experiment
 from ..experiment.plan import Experiment
 from ..metrics import pooled_rmse
-from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
 from ..results.summary import Record, groups, records
 from .printing import machine_text, made
 

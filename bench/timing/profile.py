@@ -15,7 +15,7 @@ from rich.table import Table
 from ...datasets import Log, Scenario, simulate
 from ...estimators.interface import Estimator
 from ...estimators.registry import ESTIMATORS, create, package_of
-from ..output.figures.drawing import PALETTE, WIDTH_IN, empty_figure, looks_of, save
+from ..drawing import PALETTE, WIDTH_IN, empty_figure, looks_of, save
 from ..output.tables import terminal
 from ..results.store import provenance
 from .passes import PARTS, Timed, quickest, stopwatch

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from ...datasets.log import Log
 from ...datasets.state import Array, TimeArray
 from ...estimators.interface import Estimator
-from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
+from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
 from .passes import Stopwatch, quickest, stopwatch
 
 LAGS_S = (1.0, 3.0, 10.0, 30.0)

@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..errors import ExperimentError
-from ..output.figures.drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..output.tables import terminal
 from ..results.paired import FEWEST_SEEDS
 from .objective import DUE, Marks

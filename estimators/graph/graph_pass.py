@@ -1,7 +1,7 @@
 """One pass of any smoother on GTSAM: it follows the orders of `keyframes`; `solvers` does the solving.
 
-One keyframe holds pose, velocity and biases; neighbours are tied by the IMU. The pass gives what it believes now, and
-of each state what it believes when that state leaves the window.
+A keyframe has pose, velocity and biases; neighbouring keyframes are connected by an IMU factor. The pass returns the
+belief now, and each smoothed state as it is when it leaves the window.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .solvers import Solver
 
 @dataclass
 class Keyframe:
-    """A state of the graph, and the motion since: what later readings and ticks are carried by.
+    """A state of the graph, and the IMU samples since, which carry it to later readings and ticks.
 
     Attributes:
         index: of its variables.
@@ -132,12 +132,12 @@ class GraphPass:
         return self._carried_on(newest, self._belief, self._now_ns, self._keyframes.not_given_out())
 
     def finish(self) -> Trajectory | None:
-        """See `Pass.finish`. States still in the window have seen less than the lag: all that there was."""
+        """See `Pass.finish`. States still in the window have seen less than the lag."""
         with gtsam_failures():
             self._follow(self._keyframes.finish())
             self._flush()
             self._solver.finish()
-            self._leave(list(self._window), gtsam.Values())
+            self._record(list(self._window), gtsam.Values())
         return Trajectory.from_beliefs(self._smoothed, self._config.window_s) if self._smoothed else None
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ class GraphPass:
         self._predicted = self._predict(record, block, t_ns)
 
     def _solve(self, oldest: int) -> None:
-        """Let what leaves the window be written down, then update, and read off the newest state.
+        """Record what leaves the window, then solve, and read off the newest state.
 
         Args:
             oldest: the oldest keyframe that stays.
@@ -180,7 +180,7 @@ class GraphPass:
         new, values = self._window[-1], gtsam.Values()
         insert_state(values, new.index, self._predicted, self._R_BI)
         leaving = [self._window.popleft() for _ in range(oldest - self._window[0].index)]
-        self._leave(leaving, values)
+        self._record(leaving, values)
         t_s = (new.t_ns - self._start_ns) * 1e-9
         stamps: dict[Any, Any] = {key(new.index): t_s for key in (X, V, B)}
         self._solver.update(self._graph, values, stamps)
@@ -267,11 +267,11 @@ class GraphPass:
     # --- smoothed states --------------------------------------------------------------------------------------------
 
     @stage("output")
-    def _leave(self, keyframes: list[Keyframe], new: gtsam.Values) -> None:
-        """Record the ticks from each keyframe to the next, as the smoother sees them now; `new` is what it will get.
+    def _record(self, keyframes: list[Keyframe], new: gtsam.Values) -> None:
+        """Record the smoothed states at the ticks after each keyframe; `new`: values that the solver lacks.
 
-        A tick is carried by the IMU from the keyframe before, with the IMU's noise since then added, although the
-        keyframe after it limits that too: between keyframes the covariance is on the safe side, of velocity by 2 %.
+        The IMU carries the state from the keyframe before the tick, and adds its noise. The keyframe after the tick
+        would lower the covariance; so between keyframes it is too large, that of velocity by 2 %.
         """
         for keyframe in keyframes:
             if keyframe.doubted:
@@ -287,7 +287,7 @@ class GraphPass:
                 self._smoothed.append(self._carried_on(keyframe, belief, t_ns))
 
     def _count_outliers(self, keyframe: Keyframe, values: gtsam.Values) -> None:
-        """Count the factors on a keyframe that end beyond the width of their loss."""
+        """Count the factors on a keyframe whose residual exceeds the width of their loss."""
         for sensor, factor, limit in keyframe.doubted:
             for i in {gtsam.Symbol(key).index() for key in factor.keys()}:  # noqa: SIM118 - a factor is no dict
                 if not values.exists(X(i)):

@@ -21,7 +21,7 @@ from .solvers import BatchLagSolver, BatchSolver, IncrementalSolver, Solver, isa
 
 @dataclass(frozen=True)
 class GtsamSmoother(GraphSmoother):
-    """What the smoothers on GTSAM can be told besides.
+    """Further options of the smoothers on GTSAM.
 
     Attributes:
         factorization: of the linear system; Cholesky fails on the IMU noise of a tactical grade.
@@ -40,16 +40,16 @@ class GtsamSmoother(GraphSmoother):
 
 @dataclass(frozen=True)
 class IncrementalSmoother(GtsamSmoother):
-    """What the smoothers on iSAM2 can be told besides: how near the optimum they stay, and at what cost.
+    """Further options of the smoothers on iSAM2: how near the optimum they stay, and at what cost.
 
-    With relinearize and wildfire all 0 and two extra updates every step ends at the optimum of what is in the graph,
-    for a cost that grows with the length of the window.
+    With relinearize and wildfire all 0 and two extra updates, every step ends at the optimum of the graph; the cost
+    then grows with the length of the window.
 
     Attributes:
         relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) above which iSAM2
-            linearises a variable anew. Position enters every factor linearly but for its rotation into B; under a
-            loss (`robust`), whose weights are renewed with the linearisation, give it a part of the sensor's sigma.
-        wildfire: an update goes down the tree as far as variables move by more than this (in their own units).
+            relinearises a variable. Position enters every factor linearly but for its rotation into B. Under a loss
+            (`robust`) weights are computed anew with the linearisation: choose a fraction of the sensor's sigma.
+        wildfire: an update goes down the tree while variables move by more than this (in their own units).
         extra_updates: Gauss–Newton steps after the one that takes in new factors.
     """
 
@@ -75,7 +75,7 @@ class FixedLagSmoother(LaggedSmoother, IncrementalSmoother):
 class BatchFixedLagSmoother(LaggedSmoother, GtsamSmoother):
     """MAP over the last lag_s seconds, solved anew at every keyframe (GTSAM's BatchFixedLagSmoother).
 
-    The same estimate as an iSAM2 that linearises everything anew in every step; a keyframe's cost grows with the lag.
+    The estimate equals that of an iSAM2 that relinearises everything in every step; the cost grows with the lag.
     """
 
     def solver(self, R_BI: Array) -> Solver:
@@ -100,17 +100,17 @@ class WholeLogSmoother(IncrementalSmoother):
 
 
 GUESS_KEYFRAMES = 50
-"""While a log lasts, `batch` on our own solver goes back so far for what it linearises anew."""
+"""Keyframes, 10 s at 5 Hz: how far back `batch` on our own solver relinearises during the log. Only a first guess."""
 
 
 @dataclass(frozen=True)
 class BatchSmoother(WholeLogSmoother):
-    """MAP over the whole log at its end: the best a smoother can do.
+    """MAP over the whole log, solved at its end: the most accurate smoother.
 
     Attributes:
-        engine: "gtsam" is iSAM2 until then, which also gives the guess that Levenberg–Marquardt starts from. "window"
-            is our own solver (`window_chain`): a filter that goes back a little while the log lasts, then Gauss–Newton
-            over all of it. One optimum; the second is there in a hundredth of the time.
+        engine: "gtsam" runs iSAM2 during the log, then Levenberg–Marquardt from its estimate. "window" is our own
+            solver (docs/window.md): a fixed-lag smoother during the log, then Gauss–Newton over all of it. Both reach
+            the same optimum; "window" takes a hundredth of the time.
     """
 
     engine: Literal["gtsam", "window"] = "gtsam"

@@ -1,1 +1,1 @@
-"""The fixed-lag Gauss-Newton smoother on block-tridiagonal normal equations, compiled."""
+"""The smoother on our own solver: options, pass, compiled steps, factors, chain; derived in docs/window.md."""

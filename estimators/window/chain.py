@@ -125,15 +125,15 @@ def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
 def smooth_covariances(nodes: NDArray[Any], low: int, newest: int) -> None:
     """Fill P_smoothed, the covariance of δ given all there is, of keyframes newest down to low; eq. (9)."""
     mask, gained = len(nodes) - 1, np.empty((DIM, DIM))
-    copy_into(nodes[newest & mask].P, nodes[newest & mask].P_smoothed)
+    copy_into(nodes[newest & mask].P[:], nodes[newest & mask].P_smoothed[:])
     for k in range(newest - 1, low - 1, -1):
         node, ahead = nodes[k & mask], nodes[(k + 1) & mask]
-        Gt, P, P_ahead, P_given = node.Gt, node.P_smoothed, ahead.P_smoothed, ahead.P_given
+        Gt, P, P_ahead, P_given = node.Gt[:], node.P_smoothed[:], ahead.P_smoothed[:], ahead.P_given[:]
         clear(gained)
         for a in range(DIM):
             for b in range(DIM):
                 add_scaled(gained[a], P_ahead[a, b] - P_given[a, b], Gt[b])
-        copy_into(node.P, P)
+        copy_into(node.P[:], P)
         for i in range(DIM):
             for a in range(DIM):
                 add_scaled(P[i], Gt[a, i], gained[a])

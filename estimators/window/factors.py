@@ -82,11 +82,11 @@ def linearise_factor(
     """
     g, C = factors[f], np.empty((3, 3))
     if g.form <= CARRIED:
-        clear(g.H_j)
+        clear(g.H_j[:])
         if g.form == CARRIED:
             n = linearise_carried(factors, f, readings, carries, x_i, rig, C)
         else:
-            n = measure(readings, f, x_i, rig, g.r, g.H, C)
+            n = measure(readings, f, x_i, rig, g.r[:], g.H[:], C)
     else:
         n = 3
         for i in range(3):
@@ -94,16 +94,18 @@ def linearise_factor(
                 C[i, j] = g.cov[i, j]
         s, e, d = x_i[0], x_j[0], displacements[f]
         if g.form == LOOSE:
-            r = preintegrated_dvl_residual(s.R_WB, s.p_WB_W, e.p_WB_W, d.dp, g.H, g.H_j)
+            r = preintegrated_dvl_residual(s.R_WB[:], s.p_WB_W[:], e.p_WB_W[:], d.dp[:], g.H[:], g.H_j[:])
         else:
             of_f = displacements[f : f + 1]
-            r = tight_dvl_residual(s.R_WB, s.p_WB_W, s.b_g, e.R_WB, e.p_WB_W, of_f, g.K, g.H, g.H_j)
+            r = tight_dvl_residual(
+                s.R_WB[:], s.p_WB_W[:], s.b_g[:], e.R_WB[:], e.p_WB_W[:], of_f, g.K[:], g.H[:], g.H_j[:]
+            )
         for i in range(3):
             g.r[i] = r[i]
-    if not whiten(n, C, g.r, g.H, g.H_j):
+    if not whiten(n, C, g.r[:], g.H[:], g.H_j[:]):
         return False
     g.n, g.fresh, g.width = n, 0, widths[g.kind, n]
-    g.weight = weight_of(g.loss, length(g.r, n), g.width)
+    g.weight = weight_of(g.loss, length(g.r[:], n), g.width)
     return True
 
 
@@ -118,11 +120,11 @@ def linearise_carried(
     """
     g, H, F, end = factors[f], np.empty((3, DIM)), np.empty((DIM, DIM)), np.empty(1, STATE)
     predict(carries[f : f + 1], x_i, rig[0].gravity, F, end)
-    n = measure(readings, f, end, rig, g.r, H, C)
-    multiply_rows(n, H, F, g.H)
+    n = measure(readings, f, end, rig, g.r[:], H, C)
+    multiply_rows(n, H, F, g.H[:])
     if g.fresh:
         HQ = np.empty((3, DIM))
-        process_noise(carries[f : f + 1], x_i[0].R_WB, F)
+        process_noise(carries[f : f + 1], x_i[0].R_WB[:], F)
         multiply_rows(n, H, F, HQ)
         for i in range(n):
             for j in range(n):
@@ -185,7 +187,7 @@ def linearise_tie(
     end, matrices, e = np.empty(1, STATE), np.empty((3, 3, 3)), np.empty(3)
     turn, S, A = matrices[0], matrices[1], matrices[2]
     predict(block, x_i, gravity, F, end)
-    process_noise(block, x_i[0].R_WB, Q)
+    process_noise(block, x_i[0].R_WB[:], Q)
     local(end, x_j, c)
     for i in range(3):
         e[i] = c[i]
@@ -197,7 +199,7 @@ def linearise_tie(
     turn_covariance(Q, S)
     for begin in (POSITION_0, VELOCITY_0):  # what p and v gain by the rotation of j; c is minus the residual
         skew_into(c[begin : begin + 3], S)
-        product_into(S, x_j[0].R_WB, A)
+        product_into(S, x_j[0].R_WB[:], A)
         for i in range(3):
             for k in range(3):
                 c[begin + i] += A[i, k] * c[k]
@@ -221,5 +223,5 @@ def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array
     for i in range(3):
         lacking[i] = m[i]
     transform_into(J, lacking, m[THETA])
-    copy_into(anchor[0].P, P)
+    copy_into(anchor[0].P[:], P)
     turn_covariance(P, J)

@@ -16,17 +16,18 @@ from .window_pass import Solving, WindowPass
 
 @dataclass(frozen=True)
 class WindowSmoother(LaggedSmoother):
-    """MAP over the last lag_s seconds on our own solver: Gauss–Newton on the chain of keyframes (see `window_chain`).
+    """MAP over the last lag_s seconds on our own solver: Gauss–Newton on the chain of keyframes (docs/window.md).
 
-    The estimate of `fls`, by the same factors at the same keyframes. A step factors one block, those that were
-    linearised anew and all since, and goes back through the window once; `refactored` and `relinearised` count them.
+    It computes the estimate of `fls`, from the same factors at the same keyframes. A step factors the new block, and
+    the blocks since the oldest keyframe that was relinearised; then it substitutes back through the window once.
+    `refactored` and `relinearised` count blocks and keyframes.
 
     Attributes:
         relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units); a keyframe that
-            has moved beyond any of them is linearised anew.
+            has moved beyond any of them is relinearised.
         extra_updates: Gauss–Newton steps after the one that takes in new factors, as long as anything moves beyond its
             threshold. With thresholds of 0 and some ten, every step ends at the optimum.
-        relinearize_prior: also linearise anew what touches the marginal prior. GTSAM's smoothers leave that be.
+        relinearize_prior: also relinearise the keyframe that the marginal prior is on. GTSAM's smoothers do not.
     """
 
     relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)

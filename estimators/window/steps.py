@@ -94,13 +94,12 @@ def extend(
         what, k, x = orders[n, 0], orders[n, 1], orders[n, 2]
         if what == KEYFRAME:
             make_keyframe(w, nodes, points, blocks, imu, rig, x)
-        elif what == AT_KEYFRAME:
-            f = add_factor(w, nodes, factors, k, rows[x].kind, forms.AT_KEYFRAME)
+        elif what in (AT_KEYFRAME, CARRIED):
+            form = forms.CARRIED if what == CARRIED else forms.AT_KEYFRAME
+            f = add_factor(w, nodes, factors, k, rows[x].kind, form)
             readings[f] = rows[x]
-        elif what == CARRIED:
-            f = add_factor(w, nodes, factors, k, rows[x].kind, forms.CARRIED)
-            readings[f] = rows[x]
-            move_along(w, nodes, points, imu, rig, k, rows[x].t_ns, carries[f : f + 1])
+            if what == CARRIED:
+                move_along(w, nodes, points, imu, rig, k, rows[x].t_ns, carries[f : f + 1])
         else:
             break
         n += 1
@@ -120,7 +119,7 @@ def make_keyframe(
     new.imu_from = end_of(w, imu, nodes[a].imu_from - v.imu_gone, t_ns) + v.imu_gone
     move_along(w, nodes, points, imu, rig, v.newest, t_ns, blocks[a : a + 1])
     x = np.empty(1, STATE)
-    retract(points[a : a + 1], nodes[a].d, x)
+    retract(points[a : a + 1], nodes[a].d[:], x)
     predict(blocks[a : a + 1], x, rig[0].gravity, F, points[b : b + 1])
     new.t_ns, new.first, new.moved = t_ns, -1, 1
     for i in range(DIM):
@@ -209,7 +208,7 @@ def linearise(
     for k in range(low, v.newest + 1):
         a = k & mask
         if has_moved(w, nodes, a, exact):
-            retract(points[a : a + 1], nodes[a].d, points[a : a + 1])
+            retract(points[a : a + 1], nodes[a].d[:], points[a : a + 1])
             for i in range(DIM):
                 nodes[a].d[i] = 0.0
             nodes[a].moved = 1
@@ -217,7 +216,7 @@ def linearise(
             v.relinearised += 1
     if first == v.oldest:
         a = first & mask
-        linearise_prior(anchor, v.mean, points[a : a + 1], nodes[a].m_given, nodes[a].P_given)
+        linearise_prior(anchor, v.mean[:], points[a : a + 1], nodes[a].m_given[:], nodes[a].P_given[:])
     first = max(v.oldest, min(first - 1, v.unsolved)) if first <= v.newest else v.unsolved
     for k in range(first, v.newest + 1):
         a, b = k & mask, (k + 1) & mask
@@ -228,11 +227,11 @@ def linearise(
         while f >= 0:
             factor = factors[f]
             stale = factor.fresh == 1 or own or (either and factor.form > forms.CARRIED)
-            if stale and not linearise_factor(factors, f, readings, carries, displacements, x_i, x_j, rig, v.widths):
+            if stale and not linearise_factor(factors, f, readings, carries, displacements, x_i, x_j, rig, v.widths[:]):
                 return -1
             f = factor.next
         if either and k < v.newest:
-            linearise_tie(blocks[a : a + 1], x_i, x_j, rig[0].gravity, node.F, node.Q, node.c)
+            linearise_tie(blocks[a : a + 1], x_i, x_j, rig[0].gravity, node.F[:], node.Q[:], node.c[:])
     for k in range(first, v.newest + 1):
         nodes[k & mask].moved = 0
     return first
@@ -262,31 +261,31 @@ def solve(
         node, ahead = nodes[k & mask], nodes[(k + 1) & mask]
         for i in range(DIM):
             node.m[i] = node.m_given[i]
-        copy_into(node.P_given, node.P)
+        m, P, m_j, P_j = node.m[:], node.P[:], ahead.m_given[:], ahead.P_given[:]
+        copy_into(node.P_given[:], P)
         f = node.first
         while f >= 0:
             g = factors[f]
             if g.form <= forms.CARRIED and g.weight > 0.0:
                 for row in range(g.n):
-                    if not absorb_row(g.r[row], g.H[row], 1.0 / g.weight, node.m, node.P):
+                    if not absorb_row(g.r[row], g.H[row], 1.0 / g.weight, m, P):
                         return NOT_POSITIVE
             f = g.next
         v.refactored += 1
         if k == v.newest:
             break
-        cross_tie(node.F, node.Q, node.c, node.m, node.P, ahead.m_given, ahead.P_given, P_ji)
+        cross_tie(node.F[:], node.Q[:], node.c[:], m, P, m_j, P_j, P_ji)
         f = node.first
         while f >= 0:
             g = factors[f]
             if g.form > forms.CARRIED and g.weight > 0.0:
                 for row in range(g.n):
                     if not absorb_joint_row(
-                        g.r[row], g.H[row], g.H_j[row], 1.0 / g.weight,
-                        node.m, node.P, ahead.m_given, ahead.P_given, P_ji,
+                        g.r[row], g.H[row], g.H_j[row], 1.0 / g.weight, m, P, m_j, P_j, P_ji
                     ):  # fmt: skip
                         return NOT_POSITIVE
             f = g.next
-        if not divide_into(ahead.P_given, P_ji, node.Gt):
+        if not divide_into(P_j, P_ji, node.Gt[:]):
             return NOT_POSITIVE
     back_substitute(nodes, max(v.oldest, min(first, v.newest - reach)), v.newest)
     v.unsolved = v.newest + 1
@@ -316,7 +315,7 @@ def forget(
     v.oldest, v.marginalised = oldest, 1
     node = nodes[oldest & mask]
     anchor[0] = points[oldest & mask]
-    copy_into(node.P_given, anchor[0].P)
+    copy_into(node.P_given[:], anchor[0].P[:])
     for i in range(DIM):
         v.mean[i] = node.m_given[i]
 
@@ -330,5 +329,5 @@ def count_outliers(w: NDArray[Any], nodes: NDArray[Any], factors: NDArray[Any], 
         while f >= 0:
             g = factors[f]
             if g.loss > 0:
-                v.outliers[g.kind] += distance(factors, f, nodes[k & mask].d, nodes[(k + 1) & mask].d) > g.width
+                v.outliers[g.kind] += distance(factors, f, nodes[k & mask].d[:], nodes[(k + 1) & mask].d[:]) > g.width
             f = g.next

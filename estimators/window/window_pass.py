@@ -1,7 +1,7 @@
-"""One pass of the window: a fixed-lag smoother of our own, and the whole log where the window has no end.
+"""One pass of the smoother on our own solver: over a fixed lag, or over the whole log.
 
-Gauss–Newton on the chain of keyframes (`chain`), which follows the orders of `keyframes` as `graph` does. The steps are
-compiled (`steps`); here they are called in their order, and here is what allocates.
+Gauss–Newton on the chain of keyframes (`chain`). It follows the orders of `keyframes`, as the passes on GTSAM do. The
+steps are compiled (`steps`); this module calls them in their order, and allocates.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Solving:
 
     Attributes:
         relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units) beyond which a
-            keyframe is linearised anew.
+            keyframe is relinearised.
         extra_updates: Gauss–Newton steps after the one that takes in new factors, as long as anything moves.
         relinearize_prior: also where a keyframe touches the marginal prior.
         reach: keyframes that a step goes back to, besides those that it changes.
@@ -120,7 +120,7 @@ class WindowPass:
         return with_rate_noise(as_belief(self._now_ns, state), self._rig)
 
     def finish(self) -> Trajectory | None:
-        """See `Pass.finish`. States still in the window have seen less than the lag: all that there was."""
+        """See `Pass.finish`. States still in the window have seen less than the lag."""
         if self._lost:
             raise Diverged("the estimate was lost before the end")
         if not self._begun:
@@ -130,7 +130,7 @@ class WindowPass:
         self._update(w["oldest"], self._solving.to_optimum)
         smooth_covariances(self._nodes, w["oldest"], w["newest"])
         self._swept = True
-        self._write_down(self._now_ns + 1)
+        self._record(self._now_ns + 1)
         count_outliers(self._w, self._nodes, self._factors, w["newest"] + 1)
         beliefs = [with_rate_noise(as_belief(t_ns, state), self._rig) for t_ns, state in self._smoothed]
         return Trajectory.from_beliefs(beliefs, self._config.window_s) if beliefs else None
@@ -138,20 +138,20 @@ class WindowPass:
     # --- a step, as docs/window.md derives it ------------------------------------------------------------------------
 
     def _follow(self, orders: NDArray[np.int64]) -> None:
-        """Do what `keyframes` has decided: extend the chain, write down what leaves, solve, and forget."""
+        """Do what `keyframes` has decided: extend the chain, record what leaves, solve, forget."""
         n = 0
         while n < len(orders):
             while (done := self._extend(orders, n)) == NO_ROOM:
                 self._make_room(len(orders))
             n = done
             if n == len(orders):
-                return  # readings that came late: they wait for the next keyframe
+                return  # late readings only: they are solved for with the next keyframe
             if orders[n, 0] == SUMMED:
                 n = self._add_displacement(orders, n)
             oldest = int(orders[n, 2])
             until_ns = self._nodes["t_ns"][oldest & (len(self._nodes) - 1)]
             if self._ticks and self._ticks[0] < until_ns:
-                self._write_down(until_ns)
+                self._record(until_ns)
             self._update(oldest)
             n += 1
 
@@ -229,11 +229,10 @@ class WindowPass:
     # --- smoothed states ---------------------------------------------------------------------------------------------
 
     @stage("output")
-    def _write_down(self, until_ns: int) -> None:
-        """Write down the states at the ticks before until_ns, as they are seen now.
+    def _record(self, until_ns: int) -> None:
+        """Record the smoothed states at the ticks before until_ns.
 
-        A tick is carried by the IMU from the keyframe before, with the IMU's noise since then added, although the
-        keyframe after it limits that too.
+        The IMU carries the state from the keyframe before the tick, and adds its noise; see `GraphPass`.
         """
         w, mask = self._w[0], len(self._nodes) - 1
         k, newest = int(w["oldest"]), int(w["newest"])
@@ -277,7 +276,7 @@ class WindowPass:
             w["n_imu"] = end
 
     def _make_room(self, more: int) -> None:
-        """See to it that as many more keyframes, factors and samples find room."""
+        """Make room for as many more keyframes, factors and samples."""
         w = self._w[0]
         while w["n_free"] < more:
             self._add_free_factors()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ....datasets.state import Array, TimeArray
-from ...output.figures.drawing import PALETTE
+from ...drawing import PALETTE
 
 COLOURS: dict[str, str] = dict(zip(("imu", "dvl", "depth", "gps", "heading"), PALETTE, strict=False))
 AXIS_COLOURS = PALETTE[:3]

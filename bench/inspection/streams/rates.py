@@ -9,7 +9,7 @@ import numpy as np
 
 from ....datasets.log import Log
 from ....datasets.state import Array, TimeArray
-from ...output.figures.drawing import logarithmic
+from ...drawing import logarithmic
 from ..findings.finding import Check, Finding
 from ..findings.panels import colour_of, thinned
 

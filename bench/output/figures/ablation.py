@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
+from ...drawing import TEXT_PT, TITLE_PT, WIDTH_IN, Look, empty_figure, legend_below, logarithmic, narrow, title_above
 from ...results.summary import Record, groups
 from ..cells import ONLINE, SMOOTHED, column, percent
 from ..sheets import variant
-from .drawing import TEXT_PT, TITLE_PT, WIDTH_IN, Look, empty_figure, legend_below, logarithmic, narrow, title_above
 
 BAR = 0.72
 """Height of a bar, in lines."""

@@ -9,11 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ...metrics import BLOCKS, DOF
-from ...metrics.consistency import Average, anees_of, interval
-from ...results.summary import Record, groups
-from ..cells import NEES_OVER_DOF, ONLINE, SMOOTHED, TIME
-from .drawing import (
+from ...drawing import (
     TEXT_PT,
     TITLE_PT,
     WIDTH_IN,
@@ -24,6 +20,10 @@ from .drawing import (
     look_handle,
     title_above,
 )
+from ...metrics import BLOCKS, DOF
+from ...metrics.consistency import Average, anees_of, interval
+from ...results.summary import Record, groups
+from ..cells import NEES_OVER_DOF, ONLINE, SMOOTHED, TIME
 
 POINTWISE = 0.95
 """Of the dark band: a consistent estimator's points lie in it with this probability, each by itself."""

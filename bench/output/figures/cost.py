@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
+from ...drawing import COLUMN_IN, TITLE_PT, WIDTH_IN, Look, empty_figure, handle, legend_below, logarithmic, narrow
 from ...results.summary import Record, groups
 from ..cells import COMPUTING, ONLINE, SMOOTHED, column
-from .drawing import COLUMN_IN, TITLE_PT, WIDTH_IN, Look, empty_figure, handle, legend_below, logarithmic, narrow
 
 
 def priced(summary: Sequence[Record]) -> list[Record]:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from ...drawing import looks_of, save
 from ...results.summary import Record, file_names, groups, records, summarise
 from .ablation import draw_ablation
 from .consistency import draw_nees
 from .cost import draw_costs, priced
-from .drawing import looks_of, save
 from .lag import draw_lag_curve, lag_curve
 from .step_time import draw_step_times, step_times
 from .track import Track, draw_errors, draw_tracks, load_trajectory, pages_of, tracks_of

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ...drawing import WIDTH_IN, Look, empty_figure, handle, legend_below, logarithmic, title_above
 from ...metrics.floor_ratio import OVER
 from ...results.summary import Record, groups
 from ..cells import COMPUTING, ONLINE, SMOOTHED, column, lag
-from .drawing import WIDTH_IN, Look, empty_figure, handle, legend_below, logarithmic, title_above
 
 FEWEST_LAGS = 3
 """Two points are no curve."""

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
+from ...drawing import COLUMN_IN, Look, empty_figure, legend_below, logarithmic, look_handle, title_above
 from ...results.step_time import StepTimes, machine_name, pooled_steps, usual_machine
 from ...results.summary import Record, groups
 from ..cells import STEP_TIME
-from .drawing import COLUMN_IN, Look, empty_figure, legend_below, logarithmic, look_handle, title_above
 
 MARKED = (0.5, 0.99)
 """Quantiles with a marker, the columns of the main table; a third marker stands at the longest step."""

@@ -14,10 +14,7 @@ from matplotlib.lines import Line2D
 
 from ....datasets.state import Array
 from ....datasets.trajectory import Trajectory
-from ...metrics import Alignment, ScoreError, align, associate
-from ...results.summary import Record
-from ..cells import DIRECTIONS, ONLINE, SMOOTHED, TIME
-from .drawing import (
+from ...drawing import (
     COLUMN_IN,
     TEXT_PT,
     TITLE_PT,
@@ -29,6 +26,9 @@ from .drawing import (
     narrow,
     title_above,
 )
+from ...metrics import Alignment, ScoreError, align, associate
+from ...results.summary import Record
+from ..cells import DIRECTIONS, ONLINE, SMOOTHED, TIME
 
 MARKS = 6
 """How many markers a track has."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ...drawing import DASHES, Look
 from ...metrics import BLOCKS
 from ...metrics.consistency import anees_of
 from ...results.summary import Record, groups
 from ..cells import ONLINE, column, output_and_lag, text
-from ..figures.drawing import DASHES, Look
 
 SYMBOL = {
     "o": "circle",

@@ -13,11 +13,11 @@ from typing import Any
 
 import pandas as pd
 
+from ...drawing import looks_of
 from ...errors import ExperimentError
 from ...results.store import load_runs
 from ...results.summary import Record, groups, records, summarise
 from .. import cells, sheets
-from ..figures.drawing import looks_of
 from ..remarks import mostly_outside, not_positive
 from . import curves, runs
 from .results import differences_of, in_order, kept_plan

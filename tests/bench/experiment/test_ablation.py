@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fathom.bench.cli.app import app
+from fathom.bench.drawing import PALETTE, looks_of, save
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution.task import Task
 from fathom.bench.execution.worker import WorkerCache
@@ -16,7 +17,6 @@ from fathom.bench.experiment.plan import Experiment
 from fathom.bench.experiment.variants import changed, named_axes, points
 from fathom.bench.metrics.comparison import Comparison
 from fathom.bench.output.figures.ablation import draw_ablation
-from fathom.bench.output.figures.drawing import PALETTE, looks_of, save
 from fathom.datasets import Log
 from typer.testing import CliRunner
 

@@ -9,13 +9,13 @@ import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
+from fathom.bench.drawing import COLUMN_IN, PALETTE, TEXT_PT, WIDTH_IN, looks_of
 from fathom.bench.execution.task import Task
 from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.scoring import SCORES
 from fathom.bench.output.figures.consistency import draw_nees
 from fathom.bench.output.figures.cost import draw_costs, priced
-from fathom.bench.output.figures.drawing import COLUMN_IN, PALETTE, TEXT_PT, WIDTH_IN, looks_of
 from fathom.bench.output.figures.figures import draw_figures
 from fathom.bench.output.figures.step_time import draw_step_times
 from fathom.bench.output.figures.track import draw_errors, draw_tracks, load_trajectory, pages_of, tracks_of

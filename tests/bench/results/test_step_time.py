@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fathom.bench.output.figures.drawing import looks_of
+from fathom.bench.drawing import looks_of
 from fathom.bench.output.figures.step_time import draw_step_times, step_times
 from fathom.bench.results.step_time import EDGES_NS, PER_DECADE, machine_name, pooled_steps, step_histogram
 
