@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
-from ..experiment.comparison import OVER_SEEDS
+from ..metrics.comparison import OVER_SEEDS
 from ..metrics.scoring import POOLED
 from .paired import FEWEST_SEEDS, TAKE, bootstrap_interval
 from .summary import Record, groups, records, summarise

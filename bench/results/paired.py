@@ -16,8 +16,8 @@ import pandas as pd
 import scipy  # its stats load when they are first asked for
 
 from ...datasets.state import Array
-from ..experiment.comparison import OVER_SEEDS, Comparison, Over
 from ..metrics.association import ScoreError
+from ..metrics.comparison import OVER_SEEDS, Comparison, Over
 from ..metrics.scoring import POOLED
 from .summary import Record, groups, records
 

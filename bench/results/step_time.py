@@ -22,7 +22,7 @@ PER_DECADE = 40
 DECADES = 13
 """From a nanosecond to nearly three hours."""
 EDGES_NS: Array = 10.0 ** (np.arange(PER_DECADE * DECADES + 1) / PER_DECADE)
-"""Of the bins."""
+"""Edges of the bins, from 1 ns, equally spaced in logarithm."""
 
 
 def step_histogram(step_ns: TimeArray) -> str:

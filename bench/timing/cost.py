@@ -142,7 +142,7 @@ def draw_accuracy_cost(rows: pd.DataFrame) -> Figure:
         logarithmic(axes, "xy")
     handles = [handle(name, look.marker, look.colour, True) for name, look in looks.items()]
     if any(row["output"] == "smoothed" for row in done):
-        handles.append(handle("with hindsight", "o", "black", False))
+        handles.append(handle("smoothed", "o", "black", False))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
 

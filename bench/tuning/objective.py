@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from ...datasets.errors import nearest
 from ...datasets.state import Array
 from ..errors import ExperimentError
-from ..experiment.comparison import OVER_SEEDS
+from ..metrics.comparison import OVER_SEEDS
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
 from ..results.paired import FEWEST_SEEDS, TAKE, bootstrap_interval

@@ -13,9 +13,9 @@ from fathom.bench.drawing import PALETTE, looks_of, save
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution.task import Task
 from fathom.bench.execution.worker import WorkerCache
-from fathom.bench.experiment.comparison import Comparison
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.experiment.variants import changed, named_axes, points
+from fathom.bench.metrics.comparison import Comparison
 from fathom.bench.output.figures.ablation import draw_ablation
 from fathom.datasets import Log
 from typer.testing import CliRunner

@@ -17,7 +17,7 @@ import pytest
 from fathom.bench.timing import comparison, revision
 from fathom.bench.timing.benchmarks import BENCHMARKS
 from fathom.bench.timing.comparison import FULL, SHORT, Effort, ratio_of, verdict_of
-from fathom.bench.timing.revision import TimingError
+from fathom.bench.timing.printing import TimingError
 
 ROOT = Path(__file__).resolve().parents[3]
 LIMIT = 1.10
@@ -144,7 +144,7 @@ def test_a_worktree_is_gone_afterwards_even_after_ctrl_c(repository: Path, tmp_p
     def interrupted() -> None:
         with revision.checked_out("HEAD~1", tmp_path) as tree:
             seen.append(tree)
-            assert (tree.root / "bench" / "run.py").is_file()
+            assert (tree.root / "bench" / "errors.py").is_file()
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -182,21 +182,13 @@ def test_dependencies_are_shared_where_what_is_imported_is_pinned_alike(reposito
     assert revision._dependencies(repository) != usual  # numba asks for it
 
 
-def test_compiled_code_is_shared_only_between_the_same_sources(repository: Path, tmp_path: Path) -> None:
-    ours, theirs = repository, tmp_path / "theirs"
-    shutil.copytree(ours, theirs)
-    for path in (theirs / "estimators").glob("*.py"):
-        os.utime(path, (1, 1))
-    cache = ours / "estimators" / "__pycache__"
-    cache.mkdir(exist_ok=True)
-    (cache / "so3.nbi").write_text("compiled")
-    assert revision.share_compiled(ours, theirs)
-    assert (theirs / "estimators" / "__pycache__" / "so3.nbi").read_text() == "compiled"
-    there, here = (folder / "estimators" / "so3.py" for folder in (theirs, ours))
-    assert there.stat().st_mtime_ns == here.stat().st_mtime_ns
-    with there.open("a") as file:
-        file.write("# another\n")
-    assert not revision.share_compiled(ours, theirs)
+def test_a_process_that_dies_is_an_error_that_names_its_side(tmp_path: Path) -> None:
+    tree = revision.Tree("then", tmp_path, Path(sys.executable), "")
+    with revision.started(revision.Side(tree, tmp_path, tmp_path)) as (worker,):  # no packages in it
+        with pytest.raises(TimingError, match=r"then: its process died \(exit code 1\)"):
+            worker.ask(prepare="ATE")
+        with pytest.raises(TimingError):
+            worker.ask(prepare="ATE")
 
 
 def test_a_benchmark_that_the_other_revision_lacks_is_new_and_one_that_we_lack_is_broken() -> None:
@@ -233,13 +225,13 @@ def test_a_planted_slowdown_of_a_score_ends_the_command_with_1(tmp_path: Path, s
     git(folder, "add", ".")
     git(folder, "commit", "-q", "-m", "Begin")
     if share:
-        with (folder / "bench" / "metrics.py").open("a", encoding="utf-8") as file:
+        with (folder / "bench" / "metrics" / "__init__.py").open("a", encoding="utf-8") as file:
             file.write(SPIN.format(share=share))
     packages = tmp_path / "packages" / "fathom"
     packages.mkdir(parents=True)
     for name in ("bench", "datasets", "estimators"):
         (packages / name).symlink_to(folder / name)
-    command = [sys.executable, "-m", "fathom.bench.cli.app", "timing", "--against", "HEAD", "--only", "ATE"]
+    command = [sys.executable, "-m", "fathom.bench.cli.app", "timing", "against", "HEAD", "--only", "ATE"]
     done = subprocess.run(
         command, env=os.environ | {"PYTHONPATH": str(packages.parent)}, capture_output=True, text=True, check=False
     )
