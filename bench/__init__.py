@@ -1,4 +1,13 @@
-"""Metrics, experiments, runner, store, reports, command line. Names load their module when first asked for."""
+"""Scores, experiments, runs and results, and the command `fathom`. Names load their module when first asked for.
+
+- `metrics`: scores of a trajectory against the truth, consistency over seeds, the floor.
+- `experiment`: what an experiment's file may state, and its variants; `experiments` holds the shipped ones.
+- `execution`: one run, worker processes, Dask, and reproducing a row.
+- `results`: the store, selection, summaries over seeds, paired differences.
+- `output`: tables, figures and the report; `inspection`: checks of a log; `tuning`: search for noise scalars.
+- `timing`: budgets, profiles, and comparison with another revision; `cli`: the command line, one file per verb.
+- `fathom`: the front of the whole package, `import fathom`.
+"""
 
 from __future__ import annotations
 

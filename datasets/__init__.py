@@ -1,4 +1,15 @@
-"""What there is to know: logs, readings, the rig, the truth; the simulator; one loader per format."""
+"""Logs: what they are made of, where they come from, and the simulator.
+
+- this folder: the types, and nothing else. `log` (streams and a log), `rig` (mountings, noise), `state` (state, error
+  order, belief), `trajectory`, `epochs` (a log cut in the order of reception), `quantities`, `times`, `errors`.
+- `formats`: one loader per file format; knows files, and no vehicle.
+- `described`: log.yaml, and from it and the files to a `Log`; also writes a log as a described folder.
+- `simulated`: missions, sensors and faults; `simulate(Scenario(...), seed)`.
+- `catalog`: descriptions of known recordings, without the recordings.
+
+Frames, signs and units are those of docs/conventions.md. The types import none of the folders; `formats` stands below
+`described`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cut a log into epochs, in the order of reception, as a vehicle would live through it."""
+"""Cut a log into epochs, in the order of reception, as a vehicle would receive it."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from .log import AttitudeStream, Log
 from .state import TimeArray
 
 DVL, DEPTH, GPS, HEADING, ATTITUDE = range(5)
+"""Kinds of readings, as READING and compiled code number them."""
+"""Kinds of readings, as READING and compiled code number them."""
 KIND = {"dvl": DVL, "depth": DEPTH, "gps": GPS, "heading": HEADING, "attitude": ATTITUDE}
 SENSOR = ("dvl", "depth", "gps", "heading", "heading")
 """Sensor name by kind; a full attitude comes from the heading sensor."""
@@ -21,8 +23,8 @@ IMU_SAMPLE = np.dtype(
     [
         ("t_ns", "i8"),  # end of the interval
         ("dt_s", "f8"),  # its length
-        ("held_s", "f8"),  # length of the gap that it is part of, over which the sample before is held; else 0
-        ("period_s", "f8"),  # what the IMU averages over, whatever it was split into
+        ("held_s", "f8"),  # length of the gap that this row is part of, in which the sample before is held; else 0
+        ("period_s", "f8"),  # sampling period of the IMU, also where a sample was split
         ("w_WI_I", "f8", (3,)),
         ("f_I", "f8", (3,)),
     ]
@@ -34,13 +36,13 @@ GAP_FACTOR = 1.5
 
 
 class Epoch(NamedTuple):
-    """What a vehicle learns between two moments of its clock.
+    """What a vehicle receives between two times.
 
     Attributes:
-        t_ns: the later moment.
-        imu: IMU_SAMPLE rows that cover the time since the epoch before, exactly: a sample that straddles a moment is
-            split there. So an epoch waits for the sample that covers its end, at most one interval of the IMU.
-        readings: READING rows received at t_ns, each true then or earlier.
+        t_ns: the later time.
+        imu: IMU_SAMPLE rows that cover exactly the time since the epoch before: a sample that straddles an epoch's end
+            is split there. So an epoch waits for the sample that covers its end, at most one interval of the IMU.
+        readings: READING rows received at t_ns, each true at that time or earlier.
         tick: the harness will ask for a belief now.
     """
 
@@ -56,10 +58,10 @@ class Voyage:
 
     Attributes:
         epochs: in the order of reception.
-        start_ns: where the first IMU block begins.
-        counts: how many IMU gaps were bridged, how many readings lay outside the IMU's time, and how many measured
-            nothing (every sigma infinite).
-        failure: why the voyage ends early, with the time, or None.
+        start_ns: start of the first IMU block.
+        counts: IMU gaps bridged, readings outside the IMU's time, and readings that measure nothing (every sigma
+            infinite).
+        failure: why the voyage ends early, with the time; or None.
     """
 
     epochs: list[Epoch]
@@ -94,11 +96,10 @@ def cut(
 
     Args:
         log: what to cut; starts at its prior's time, or at its first IMU sample.
-        ticks_ns: (k,) increasing; moments at which a belief will be asked for. Those outside the IMU's time are
-            passed over.
+        ticks_ns: (k,) increasing; times at which a belief will be asked for. Those outside the IMU's time are ignored.
         sensors: aiding sensors to keep; all when None.
-        max_gap_s: longest gap in the IMU that is bridged (its last sample held, its covariance grown). A longer one
-            ends the voyage, and `failure` says so.
+        max_gap_s: longest gap of the IMU that is bridged: the last sample is held, and the covariance grows. A longer
+            one ends the voyage, with `failure` set.
     """
     start_ns, end_ns = log.start_ns, int(log.imu.t_ns[-1])
     failure, end_ns, gaps = _first_long_gap(log, start_ns, end_ns, max_gap_s)
@@ -137,7 +138,7 @@ def _first_long_gap(log: Log, start_ns: int, end_ns: int, max_gap_s: float) -> t
 
 
 def _intervals(log: Log, start_ns: int) -> TimeArray:
-    """Return how long nothing had been heard of the IMU at each of its samples, (n,) ns."""
+    """Return the time since the sample before, for each IMU sample, (n,) ns."""
     first = int(log.imu.t_ns[0])
     return np.diff(log.imu.t_ns, prepend=min(start_ns, first - log.imu.period_ns))
 
@@ -145,7 +146,7 @@ def _intervals(log: Log, start_ns: int) -> TimeArray:
 def _imu_table(log: Log, times: TimeArray, start_ns: int, end_ns: int) -> NDArray[Any]:
     """Return the samples after start_ns as IMU_SAMPLE rows, split at `times`.
 
-    In a gap the sample before is held, up to one period before the next: no row knows of a later sample than its own.
+    In a gap the sample before is held, up to one period before the next one, so that no row uses a later sample.
     """
     imu, period_ns = log.imu, log.imu.period_ns
     interval = _intervals(log, start_ns)

@@ -1,4 +1,4 @@
-"""The one exception of this package that a caller might catch, and what our errors say of input that does not fit."""
+"""`DatasetError`, the one exception of this package that a caller might catch, and the wording of its messages."""
 
 from __future__ import annotations
 
@@ -14,49 +14,49 @@ if TYPE_CHECKING:
 
 
 class DatasetError(ValueError):
-    """A log, a description of one, or a trajectory file cannot be used; says what, where and what to do."""
+    """A log, a description or a trajectory file cannot be used; the message says what, where and what to do."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'x'?" for the known name closest to `name`, or ""; case does not count."""
+    """Return "; did you mean 'x'?" for the known name closest to `name`, or "" if none is close; ignores case."""
     folded = {other.casefold(): other for other in known}
     close = difflib.get_close_matches(name.casefold(), folded, n=1)
     return f"; did you mean {folded[close[0]]!r}?" if close else ""
 
 
 def nearest_file(path: Path, *, folders: bool = False) -> str:
-    """Return what `nearest` says of a file that is not there, of the files (and folders) beside it."""
+    """Return `nearest` for a missing file, among the files (and folders) next to it."""
     beside = path.parent.iterdir() if path.parent.is_dir() else []
     return nearest(path.name, [other.name for other in beside if folders or other.is_file()])
 
 
 def one_line(error: Exception) -> str:
-    """Return the kind of an error and what it says, in one line."""
+    """Return the class and the message of an error, on one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def not_loaded(point: EntryPoint, error: Exception) -> str:
-    """Say that what an installed package brings cannot be loaded, and why."""
+    """Return that an entry point of an installed package cannot be loaded, and why."""
     package = point.dist.name if point.dist else point.value
     return f"cannot be loaded from the package {package!r}: {one_line(error)}"
 
 
 LONGEST_VALUE = 60
-"""How many characters of a value that does not fit an error shows."""
+"""Characters of an invalid value that an error shows."""
 
 
 def complaints(
     error: ValidationError, model: Any, above: Sequence[str] = (), renamed: Mapping[str, str] | None = None
 ) -> list[str]:
-    """Return what pydantic found wrong in a file, in sentences: place, what is wrong, what was found.
+    """Translate pydantic's errors into sentences: the key's path, the problem, and the value found.
 
-    Unknown keys come first, since a misspelt key is also a missing one, and name the nearest known key.
+    Unknown keys come first, with the nearest known key, since a misspelt key is reported as missing as well.
 
     Args:
-        error: as validating `model` raised it.
+        error: raised by validating `model`.
         model: a pydantic model or dataclass.
-        above: the keys under which the model stands in the file.
-        renamed: what keys of an older version are called now.
+        above: the path of the model in the file.
+        renamed: old names of keys, with their new names.
     """
     every = error.errors(include_url=False)
     # where no item of a list fits, pydantic also says that the list is empty
@@ -66,7 +66,7 @@ def complaints(
 
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-"""What pydantic calls an unknown key, of a model and of a dataclass."""
+"""Pydantic's types of error for an unknown key, in a model and in a dataclass."""
 
 
 def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[str, str]) -> str:
@@ -119,7 +119,7 @@ def _bare(kind: Any) -> Any:
 
 
 def _tag(kind: Any) -> str | None:
-    """Return the tag by which a member of a union is told apart; None where it has none."""
+    """Return the tag that identifies a member of a union; None if it has none."""
     return next((note.tag for note in getattr(kind, "__metadata__", ()) if hasattr(note, "tag")), None)
 
 

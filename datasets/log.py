@@ -75,8 +75,8 @@ class ReadingStream:
 
     Attributes:
         t_ns: (n,) when each was true, in order.
-        received_ns: (n,) when each came; never before it was true.
-        z: (n, k) what was read: dvl v_WB_B m/s (k = 3), depth z_W m (1, up positive), gps p_WG_W m (3),
+        received_ns: (n,) when each was received; never before it was true.
+        z: (n, k) readings: dvl v_WB_B m/s (k = 3), depth z_W m (1, up positive), gps p_WG_W m (3),
             heading psi rad (1: yaw of the sensor's x axis, counter-clockwise from east), attitude R_WH (9, by rows).
         sigma: (n, m) standard deviation of each component of the residual (m = 3, 1, 3, 1, 3), inf where that
             component was not measured.
@@ -111,25 +111,25 @@ class ReadingStream:
 
 
 class DvlStream(ReadingStream):
-    """Bottom-track velocity of B, in B axes (equation 4)."""
+    """Bottom-track velocity of B, in B axes; docs/conventions.md (4)."""
 
     name, width, residual_width = "dvl", 3, 3
 
 
 class DepthStream(ReadingStream):
-    """Height of the pressure sensor in W, up positive (equation 1)."""
+    """Height of the pressure sensor in W, up positive; docs/conventions.md (1)."""
 
     name, width, residual_width = "depth", 1, 1
 
 
 class GpsStream(ReadingStream):
-    """Position of the antenna in W (equation 2)."""
+    """Position of the antenna in W; docs/conventions.md (2)."""
 
     name, width, residual_width = "gps", 3, 3
 
 
 class HeadingStream(ReadingStream):
-    """Yaw of the heading sensor's x axis; only that (the yaw residual)."""
+    """Yaw of the heading sensor's x axis and nothing else; docs/conventions.md (15)."""
 
     name, width, residual_width = "heading", 1, 1
 
@@ -140,7 +140,7 @@ class HeadingStream(ReadingStream):
 
 
 class AttitudeStream(ReadingStream):
-    """Full attitude R_WH of the heading sensor (equation 3); counts as the sensor "heading"."""
+    """Full attitude R_WH of the heading sensor; docs/conventions.md (3). It counts as the sensor "heading"."""
 
     name, width, residual_width = "attitude", 9, 3
 
@@ -164,15 +164,15 @@ class Log:
     """One voyage.
 
     Attributes:
-        name: what tables call it.
+        name: its name in tables.
         rig: extrinsics, noise, gravity.
         imu: inertial samples; every log has them.
         dvl, depth, gps, heading: aiding sensors, each None where the vehicle has none.
-        truth: what scores compare with; None where nobody knows.
-        truth_kind: "truth", or "reference" where it is another filter's output; tables repeat it.
-        prior: belief at the start, where the log's maker states one (simulations do); else `initialise` makes it.
-        notes: what was repaired, converted, counted or fitted on the way in, in sentences.
-        origin: (latitude °, longitude °) of W's origin, where the log is geodetic.
+        truth: trajectory to score against; None if unknown.
+        truth_kind: "truth", or "reference" for the output of another filter; tables print it.
+        prior: belief at the start, if the log states one (simulated logs do); else `initialise` makes it.
+        notes: what was repaired, converted, counted or fitted on reading, one sentence each.
+        origin: (latitude °, longitude °) of W's origin, if the log is geodetic.
     """
 
     name: str
@@ -190,13 +190,13 @@ class Log:
 
     @property
     def streams(self) -> dict[str, ReadingStream]:
-        """The aiding streams that are there, by sensor name."""
+        """The aiding streams that this log has, by sensor name."""
         every = {"dvl": self.dvl, "depth": self.depth, "gps": self.gps, "heading": self.heading}
         return {name: stream for name, stream in every.items() if stream is not None}
 
     @property
     def start_ns(self) -> int:
-        """Where the voyage begins: the prior's time, else the start of the first IMU sample's interval."""
+        """Start of the voyage: the prior's time, else the start of the first IMU sample's interval."""
         return self.prior.t_ns if self.prior is not None else int(self.imu.t_ns[0]) - self.imu.period_ns
 
     @property

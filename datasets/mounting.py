@@ -1,4 +1,4 @@
-"""How a file says where a sensor sits on the vehicle: the part `mounting` of a log.yaml and of a scenario."""
+"""The part `mounting` of a log.yaml and of a scenario: the pose of a sensor on the vehicle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rig: where every sensor sits on the body, how noisy it is, and what gravity and the Earth's turning are there."""
+"""The rig: mounting of every sensor on the body, noise of the IMU, gravity and the Earth's rate."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .errors import DatasetError
 from .state import Array
 
 EARTH_RATE_RAD_S = 7.292115e-5
-"""WGS 84: 15.04 °/h."""
+"""rad/s, from WGS 84: 15.04 °/h."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Rig:
         imu_noise: its densities and bias figures.
         depth, gps, heading: mountings of the pressure sensor P, the GPS antenna G, the heading sensor H.
         gravity: m/s², positive; g_W = (0, 0, −gravity).
-        latitude_deg: of W's origin; None where it is not known (or, simulated, where the Earth does not turn).
+        latitude_deg: of W's origin; None if unknown (or, in a simulation, if the Earth does not turn).
     """
 
     imu_noise: ImuNoise
@@ -81,7 +81,7 @@ class Rig:
         """
         if self.latitude_deg is None:
             raise DatasetError(
-                "rig: no latitude, so how the Earth turns W is not known; give `origin` in log.yaml, or `latitude_deg` "
+                "rig: no latitude, so the Earth's rate in W is unknown; give `origin` in log.yaml, or `latitude_deg` "
                 "in a scenario, or leave `earth_rotation` out"
             )
         latitude = math.radians(self.latitude_deg)

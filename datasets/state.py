@@ -1,7 +1,7 @@
 """The navigation state, its error coordinates, and a belief: a state with its covariance.
 
 The error state has fifteen components, in this order everywhere: theta (R_WB exp(theta), rad, in B), p (m, in W),
-v (m/s, in W), b_a (m/s²) and b_g (rad/s), both in the IMU's axes.
+v (m/s, in W), b_a (m/s²) and b_g (rad/s), both in the IMU's axes. See docs/conventions.md (7) and (8).
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ Array: TypeAlias = NDArray[np.float64]
 TimeArray: TypeAlias = NDArray[np.int64]
 
 LIMIT_NS = 1 << 62
-"""Times beyond this are no times: 146 years either side of 1970. Two of them subtract without overflow."""
+"""ns: times beyond this are invalid, 146 years either side of 1970. Two times within it subtract without overflow."""
 
+# Where each part of the error stands, docs/conventions.md (7).
 THETA = slice(0, 3)
 POSITION = slice(3, 6)
 VELOCITY = slice(6, 9)
 ACCEL_BIAS = slice(9, 12)
 GYRO_BIAS = slice(12, 15)
 DIM = 15
+"""Components of the error."""
+"""Components of the error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,7 @@ class NavState:
     dim = DIM
 
     def retract(self, error: Array) -> NavState:
-        """Return this state ⊕ error, error (15,) in the order of this module."""
+        """Return this state ⊕ error, error (15,); docs/conventions.md (7)."""
         return NavState(
             self.R_WB @ Rotation.from_rotvec(error[THETA]).as_matrix(),
             self.p_WB_W + error[POSITION],
@@ -58,7 +61,7 @@ class NavState:
         )
 
     def local(self, other: NavState) -> Array:
-        """Return the error (15,) with self ⊕ error = other."""
+        """Return the error (15,) with self ⊕ error = other; docs/conventions.md (8)."""
         return np.concatenate(
             [
                 Rotation.from_matrix(self.R_WB.T @ other.R_WB).as_rotvec(),
@@ -72,7 +75,7 @@ class NavState:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """A state at t_ns with the covariance P (15, 15) of its error; P is NaN where the estimator keeps none."""
+    """A state at t_ns with the covariance P (15, 15) of its error; P is NaN if the estimator keeps none."""
 
     t_ns: int
     state: NavState

@@ -1,4 +1,4 @@
-"""Times as files write them, exactly: text, integers or floats in a unit, to int64 nanoseconds."""
+"""Times from files, without loss: text, integers or floats in a unit, to int64 nanoseconds."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from .state import LIMIT_NS, TimeArray
 
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-
-
+"""Nanoseconds per unit."""
 NO_TIME = Decimal("nan")
 
 
@@ -20,7 +19,7 @@ def times_ns(values: NDArray[Any], unit: str) -> tuple[TimeArray, NDArray[np.boo
     """Convert times as read to nanoseconds; text and integers exactly, floats to the nearest nanosecond.
 
     Returns:
-        (n,) int64, and a mask of the rows that hold a time; the others are 0.
+        (n,) int64, and a mask of the rows with a valid time; the others are 0.
     """
     factor = NS_PER[unit]
     if values.dtype.kind in "iu":
@@ -51,8 +50,6 @@ def seconds_to_ns(text: str) -> int:
     Raises:
         ValueError: not a number, or one beyond LIMIT_NS.
     """
-    from decimal import Decimal
-
     try:
         ns = (Decimal(text) * 1_000_000_000).to_integral_value()
         if abs(ns) < LIMIT_NS:

@@ -1,4 +1,4 @@
-"""A trajectory: arrays of states over time, and how much of the future they have seen."""
+"""A trajectory: arrays of states over time, with the look-ahead of the estimator that made them."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Trajectory:
         t_ns: (n,) increasing.
         R_WB: (n, 3, 3).
         p_WB_W: (n, 3) m.
-        v_WB_W: (n, 3) m/s, where known.
-        b_a, b_g: (n, 3) m/s² and rad/s in the IMU's axes, where known.
-        P: (n, 15, 15) covariance of the error state, where kept; rows of NaN where it was not asked for.
+        v_WB_W: (n, 3) m/s, or None if unknown.
+        b_a, b_g: (n, 3) m/s² and rad/s in the IMU's axes, or None.
+        P: (n, 15, 15) covariance of the error state, or None; rows of NaN where it was not asked for.
         lookahead_s: how much of the future each state has seen: 0 for a filter, the lag for a fixed-lag smoother,
             infinity for a batch.
     """
@@ -77,7 +77,7 @@ class Trajectory:
         )
 
     def state(self, row: int) -> NavState:
-        """Return one row as a state; what is not known is zero."""
+        """Return one row as a state; unknown parts are zero."""
         zero = np.zeros(3)
         return NavState(
             self.R_WB[row],
@@ -89,7 +89,7 @@ class Trajectory:
 
     @classmethod
     def from_beliefs(cls, beliefs: list[Belief], lookahead_s: float = 0.0) -> Trajectory:
-        """Stack beliefs, in time order; P is None where no belief has a covariance."""
+        """Stack beliefs, in time order; P is None if no belief has a covariance."""
         P = np.array([b.P for b in beliefs]).reshape(-1, 15, 15)
         return cls(
             np.array([b.t_ns for b in beliefs], dtype=np.int64),
@@ -115,8 +115,8 @@ class Trajectory:
         """Read a TUM file; times keep their nanoseconds.
 
         Raises:
-            DatasetError: names the file: it is not there or cannot be read, a row without eight numbers, a quaternion
-                more than 1e-3 from unit length, a time that is none, or times out of order.
+            DatasetError: names the file: it is missing or cannot be read, a row without eight numbers, a quaternion
+                more than 1e-3 from unit length, an invalid time, or times out of order.
         """
         path = Path(path)
         t_ns, poses = array("q"), array("d")
@@ -172,7 +172,7 @@ class Trajectory:
         """Inverse of `to_pandas`.
 
         Raises:
-            DatasetError: a column is missing, or a time is none.
+            DatasetError: a column is missing, or a time is invalid.
         """
         from .times import times_ns
 

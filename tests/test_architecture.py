@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import re
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -16,15 +19,22 @@ HEAVY = {"matplotlib", "pandas", "gtsam", "numba", "numpy", "scipy", "pyarrow"}
 SOURCES = [path for folder in LEVEL for path in sorted((ROOT / folder).rglob("*.py"))]
 SOURCES = [path for path in SOURCES if "__pycache__" not in path.parts]
 FOLDERS = sorted({path.parent for path in SOURCES})
+TOP = ROOT / "bench" / "fathom"
+"""Holds the `__init__` of the package `fathom` itself, which has no folder of its own at the top."""
 MOST_MODULES = 16
 """In one folder; more cannot be taken in at a glance."""
 MOST_FLOORS = 10
-FRONTS = {"estimators.registry"}
+FRONTS = {"estimators.registry", "bench.output.present"}
 """Modules that gather a folder and those below it, as `__init__` does: a floor of their own, above both."""
 
 
-def imports(path: Path) -> Iterator[tuple[str, ...]]:
+@cache
+def imports(path: Path) -> tuple[tuple[str, ...], ...]:
     """Every module a file imports, in dotted parts; our own start with "fathom"."""
+    return tuple(_imports(path))
+
+
+def _imports(path: Path) -> Iterator[tuple[str, ...]]:
     here = ("fathom", *path.relative_to(ROOT).parts[:-1])
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -105,9 +115,25 @@ def test_no_folder_holds_more_than_can_be_taken_in(folder: Path) -> None:
     assert len(list(folder.glob("*.py"))) <= MOST_MODULES
 
 
+def test_every_folder_is_installed() -> None:
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    names = {".".join(("fathom", *folder.relative_to(ROOT).parts)) for folder in FOLDERS if folder != TOP}
+    assert {"fathom", *names} <= set(packages)
+
+
 def test_gtsam_is_imported_in_one_folder_only() -> None:
     having = {room_of(name) for name, path in MODULES.items() if any(parts[0] == "gtsam" for parts in imports(path))}
     assert having == {"estimators.graph"}
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests" / "estimators").rglob("*.py")), ids=lambda path: path.name)
+def test_tests_of_estimators_do_without_the_harness(path: Path) -> None:
+    assert not [parts for parts in imports(path) if parts[:2] == ("fathom", "bench")]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "tests").rglob("test_*.py")), ids=lambda path: path.name)
+def test_no_test_module_imports_another(path: Path) -> None:
+    assert not [parts for parts in imports(path) if parts[0].startswith("test_")]
 
 
 def test_the_walk_sees_relative_imports() -> None:
@@ -128,3 +154,48 @@ def test_the_command_line_imports_nothing_heavy_at_its_top() -> None:
         named |= {node.module or "" for node in top if isinstance(node, ast.ImportFrom) and not node.level}
         assert not {name.split(".")[0] for name in named} & HEAVY
         assert not [node for node in top if isinstance(node, ast.ImportFrom) and node.level > 1]
+
+
+def constants(path: Path) -> Iterator[tuple[str, bool]]:
+    """Every numeric constant of a module, and whether a docstring or a comment (above it or its block) explains it."""
+    lines, body = path.read_text(encoding="utf-8").splitlines(), ast.parse(path.read_text(encoding="utf-8")).body
+    for node, after in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None or not holds_a_number(node.value):
+            continue
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        parts = [part for target in targets for part in (target.elts if isinstance(target, ast.Tuple) else [target])]
+        named = [part.id for part in parts if isinstance(part, ast.Name) and part.id.lstrip("_").isupper()]
+        if not named or len(named) < len(parts):
+            continue
+        above = next((line for line in lines[node.lineno - 2 :: -1] if not re.match(r"[A-Z_, ]+ = ", line)), "")
+        beside = "\n".join(lines[node.lineno - 1 : node.end_lineno])
+        said = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and type(after.value.value) is str
+        yield ", ".join(named), said or "#" in beside or above.startswith("#")
+
+
+def holds_a_number(value: ast.expr) -> bool:
+    """Whether a value is made of numbers: 3, -1, 1 << 20, (4.2, 2.7), DEGREE / 60, {"imu": 0.1}, np.arange(0, 3)."""
+    if isinstance(value, ast.Constant):
+        return isinstance(value.value, int | float) and not isinstance(value.value, bool)
+    if isinstance(value, ast.UnaryOp):
+        return holds_a_number(value.operand)
+    if isinstance(value, ast.BinOp):
+        return any(holds_a_number(side) for side in (value.left, value.right))
+    if isinstance(value, ast.Tuple | ast.List):
+        return bool(value.elts) and all(map(holds_a_number, value.elts))
+    if isinstance(value, ast.Dict):
+        return bool(value.values) and all(map(holds_a_number, value.values))
+    return isinstance(value, ast.Call) and bool(value.args) and all(map(holds_a_number, value.args))
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_number_at_the_top_of_a_module_has_a_reason(path: Path) -> None:
+    assert not [name for name, has_a_reason in constants(path) if not has_a_reason]
+
+
+def test_a_number_without_a_reason_is_seen(tmp_path: Path) -> None:
+    module = tmp_path / "module.py"
+    module.write_text(
+        'A = 3\nB = 2.5\n"""m/s, from the data sheet."""\nC = 1 << 20  # bytes\nD = (1.0, -2.0)\nE = "x"\n'
+    )
+    assert dict(constants(module)) == {"A": False, "B": True, "C": True, "D": False}

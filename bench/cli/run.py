@@ -44,14 +44,15 @@ def run(
     from ..output.present import present, print_log
 
     plan = Experiment.load(experiment)
-    folder, printed = out / plan.name, []
+    folder = out / plan.name
+    printed: set[str] = set()
 
-    def show(rows: pd.DataFrame) -> None:
+    def print_finished(rows: pd.DataFrame) -> None:
         print_log(rows, plan)
-        printed.append(rows["log"].iloc[0])
+        printed.update(rows["log"])
 
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
-        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, show)
+        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, print_finished)
     present(outcome, plan, folder, printed)
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run

@@ -278,7 +278,7 @@ class _Progress:
         what = f"{rows[0]['log']} / {rows[0]['label']}: {rows[0]['status']}"
         self.bar.start()  # `clear` may have stopped it
         self.bar.update(self.task, advance=1, description=what)
-        if not self.terminal and monotonic() > self.line_s + LINE_EVERY_S:
+        if not self.terminal and self.done < self.total and monotonic() > self.line_s + LINE_EVERY_S:
             self.line_s = monotonic()
             self.say(f"{self.done} of {self.total} runs finished; the last: {what}")
 

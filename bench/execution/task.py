@@ -135,7 +135,7 @@ def parquet(trajectory: Trajectory) -> bytes:
     import pyarrow as pa
     from pyarrow.parquet import write_table
 
-    columns = trajectory.to_columns()
+    columns: dict[str, Any] = {**trajectory.to_columns()}
     for i in range(15):
         for j in range(i, 15):
             values = columns.pop(f"P_{i}_{j}", None)

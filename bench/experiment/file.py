@@ -15,8 +15,8 @@ from ...datasets.errors import nearest
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import FACTORS, sensors_among
 from ..metrics import Alignment, Dims
+from ..metrics.comparison import OVER_SEEDS
 from ..metrics.scoring import Scoring
-from .comparison import OVER_SEEDS
 from .specs import EstimatorSpec, LogSpec
 from .variants import Grid, changed, points
 

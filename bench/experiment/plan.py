@@ -14,8 +14,8 @@ from pydantic.dataclasses import dataclass
 
 from ...datasets.errors import complaints, nearest
 from ..errors import ExperimentError
+from ..metrics.comparison import Comparison
 from ..metrics.scoring import Scoring
-from .comparison import Comparison
 from .file import STRICT, ExperimentFile, Settings, Sides, refuse_twice, refuse_unknown
 from .packaged import shipped_experiments
 from .specs import EstimatorSpec, LogSpec, Run, plain

@@ -1,4 +1,4 @@
-"""What a recording holds that nobody has described yet: its messages, how often they come, and their fields."""
+"""The contents of a recording without a log.yaml: its messages, their rates and their fields."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from ...datasets.formats.recording import Held
+from ...datasets.formats.recording import TopicInfo
 
 
-def print_contents(held: Sequence[Held], console: Console) -> None:
+def print_contents(held: Sequence[TopicInfo], console: Console) -> None:
     """Print one row per kind of message; the fields are the columns that a log.yaml can name."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for heading in ("message", "type", "from", "n", "Hz", "fields"):

@@ -1,4 +1,4 @@
-"""Inspect a log: put every question to it, and gather what looks wrong."""
+"""Inspect a log: open it, run every check, and collect the findings."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ SINGLE = (
     check_noise,
 )
 LARGEST = 1e30
-"""No reading is as large, whatever its unit."""
+"""In any unit. No reading is as large, and the square of one still fits a float."""
 REPAIRED = re.compile(r"^(\w+): (\d+) rows (.+) \(repair\) dropped$")
-MENDS = {
+FIXES = {
     "out of order": "streams.{}.time.column: the one that runs evenly; else drop those rows in the file",
     "not finite": "streams.{}.valid: {{column: …, values: […]}} leaves those rows out",
     "received before they were true": "streams.{0}.time.received and .clock_offset_s: the two are not on one clock",
@@ -43,7 +43,7 @@ MENDS = {
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found in one log, check by check."""
+    """The results of all checks of one log."""
 
     log: Log
     checks: tuple[Check, ...]
@@ -55,10 +55,10 @@ class Inspection:
 
 
 def open_to_inspect(name: str | Path, data: Path | None = None) -> tuple[Log, tuple[str, ...]]:
-    """Open a log, repaired only if it does not open otherwise; return it and the notes of what was repaired.
+    """Open a log, with repair only if it does not open without; return it and the notes of what was repaired.
 
     Raises:
-        DatasetError: it does not open even so.
+        DatasetError: it does not open even with repair.
     """
     try:
         log, repairs = open_log(name, data), ()
@@ -72,7 +72,7 @@ def open_to_inspect(name: str | Path, data: Path | None = None) -> tuple[Log, tu
 
 
 def _check_sizes(name: str | Path, log: Log) -> None:
-    """Refuse numbers whose squares no sum can hold, and sigmas whose inverse is one.
+    """Refuse numbers whose squares overflow, and sigmas whose inverse squares do.
 
     Raises:
         DatasetError: names the stream, the row and the number.
@@ -84,7 +84,7 @@ def _check_sizes(name: str | Path, log: Log) -> None:
     stated |= {f"streams.{k}: sigma": float(s.sigma.min(initial=np.inf)) for k, s in log.streams.items()}
     for where, value in stated.items():
         if LARGEST < value < np.inf or 0 < value < 1 / LARGEST:
-            raise DatasetError(f"{name}: {where} is {value:.3g}, which is no sensor's; check it, and its unit")
+            raise DatasetError(f"{name}: {where} is {value:.3g}, which is no sensor's; check the value and its unit")
     for stream, arrays in held.items():
         for values in arrays:
             beyond = np.argwhere(np.isfinite(values) & (np.abs(values) > LARGEST))
@@ -97,22 +97,22 @@ def _check_sizes(name: str | Path, log: Log) -> None:
 
 
 def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Inspection:
-    """Put every check to a log; `repairs` are the notes of what opening it has had to drop."""
-    from .between.cross import cross_checks
+    """Run every check on a log; `repairs` are the notes of the rows that opening it had to drop."""
+    from .between.cross_checks import cross_checks
 
     checks = [check(log) for check in SINGLE]
     return Inspection(log, (_check_repairs(log, repairs), *checks, *cross_checks(log)))
 
 
 def _check_repairs(log: Log, repairs: Sequence[str]) -> Check:
-    """Tell what was dropped to open the log."""
+    """Report the rows that were dropped to open the log."""
     findings = [Finding("imc", f"The file is damaged: {note}.") for note in log.notes if note.startswith("imc: ")]
     for note in repairs:
         match = REPAIRED.match(note)
         if match is not None:
             stream, count, what = match.groups()
-            mend = MENDS.get(what, "").format(stream)
-            findings.append(Finding(stream, f"{count} {stream} rows are {what}; they were left out here.", mend))
+            fix = FIXES.get(what, "").format(stream)
+            findings.append(Finding(stream, f"{count} {stream} rows are {what}; they were left out here.", fix))
     duration = f"{log.duration_s:.1f} s"
     streams = ", ".join(["imu", *log.streams, *([log.truth_kind] if log.truth is not None else [])])
     dropped = "; ".join(note for note in log.notes if note.endswith("dropped"))

@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".pdf", ".svg")
 COLUMNS = 3
+"""Panels side by side; with PANEL_IN a page as wide as a landscape A4 sheet, 12.6 in."""
 PANEL_IN = (4.2, 2.7)
+"""Inches, width and height of one panel: wide enough for three legend entries."""
 
 
 def print_inspection(inspection: Inspection, console: Console) -> None:
-    """Print the facts of every check, then what looks wrong and how to mend it."""
+    """Print the facts of every check, then what looks wrong and how to fix it."""
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
@@ -44,9 +46,9 @@ def print_inspection(inspection: Inspection, console: Console) -> None:
     table.add_column(justify="right")
     table.add_column()
     for number, finding in enumerate(inspection.findings, start=1):
-        table.add_row(Text(f"{number}."), Text(finding.says))
-        if finding.mend:
-            table.add_row("", Text(f"→ log.yaml: {finding.mend}", style="cyan"))
+        table.add_row(Text(f"{number}."), Text(finding.message))
+        if finding.fix:
+            table.add_row("", Text(f"→ log.yaml: {finding.fix}", style="cyan"))
     console.print(Padding(table, (0, 0, 0, 1), expand=False))
 
 
@@ -76,14 +78,14 @@ def draw_inspection(inspection: Inspection) -> Figure:
 
 
 def page_file(out: Path | None, name: str) -> Path:
-    """Return where the figure of the log called `name` goes.
+    """Return the path of the figure of the log called `name`.
 
     Args:
         out: a file; or a folder, for inspect-NAME.png in it; or None, for that in the current folder.
         name: of the log.
 
     Raises:
-        DatasetError: a file of a format that is none of FORMATS.
+        DatasetError: the suffix is not one of FORMATS.
     """
     if out is None or out.is_dir() or not out.suffix:
         plain = re.sub(r"[^\w.=+-]+", "_", name)
@@ -94,7 +96,7 @@ def page_file(out: Path | None, name: str) -> Path:
 
 
 def save_page(inspection: Inspection, file: Path) -> None:
-    """Write the figure; the suffix of the file says as what.
+    """Write the figure, in the format of the file's suffix.
 
     Raises:
         DatasetError: it cannot be written.
@@ -102,7 +104,7 @@ def save_page(inspection: Inspection, file: Path) -> None:
     undated = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(file.suffix.lower(), {})
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with catch_warnings():  # a name in letters that the font has not is shown as boxes
+        with catch_warnings():  # letters that the font lacks are shown as boxes
             filterwarnings("ignore", message="Glyph", category=UserWarning)
             draw_inspection(inspection).savefig(file, dpi=130, metadata=undated)
     except OSError as error:

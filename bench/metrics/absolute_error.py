@@ -1,4 +1,4 @@
-"""How far from the truth: ATE, horizontal error, and drift over the whole log and within each GPS outage."""
+"""Absolute errors: ATE, horizontal error, and drift over the whole log and within each GPS outage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .pose_error import Dims, heading_roll_pitch, positions, rmse, rotation_angl
 
 @dataclass(frozen=True)
 class Ate:
-    """Absolute trajectory error over n poses. Rotations are None where truth or estimate has no attitude."""
+    """Absolute trajectory error over n poses. Rotations are None if truth or estimate has no attitude."""
 
     rmse_m: float
     mean_m: float
@@ -40,12 +40,14 @@ def ate(
 ) -> Ate:
     """Absolute trajectory error: |p_est − p_true| and the angle of R_trueᵀ R_est, after alignment.
 
+    See docs/conventions.md (51).
+
     Args:
         truth: rows of NaN in R_WB: attitude unknown; z of NaN: height unknown, which needs dims "2d".
-        estimate: at times the truth has, or see `associate`.
+        estimate: at the truth's times, or see `associate`.
         align: see `fathom.bench.metrics.alignment.align`.
         tolerance_ns: see `associate`.
-        dims: "2d" counts horizontal positions only; rotations are not concerned.
+        dims: "2d" scores horizontal positions only; rotations are not affected.
 
     Raises:
         ScoreError: nothing to compare, or the alignment is not determined.
@@ -90,7 +92,7 @@ def horizontal_error(
 
 @dataclass(frozen=True)
 class Drift:
-    """Error at the end and at its worst, m and % of the distance travelled (None where nothing was travelled)."""
+    """Error at the end and at its worst, m and % of the distance travelled (None if that is zero)."""
 
     end_m: float
     max_m: float
@@ -105,7 +107,9 @@ class Drift:
 def drift(
     truth: Trajectory, estimate: Trajectory, align: Alignment = "none", tolerance_ns: int = 0, dims: Dims = "2d"
 ) -> Drift:
-    """Position error at the end, and the largest anywhere, over the distance travelled along the truth.
+    """Position error at the end, and the largest, over the distance travelled along the truth.
+
+    See docs/conventions.md (53).
 
     Args:
         truth, estimate, align, tolerance_ns: as for `ate`.
@@ -133,7 +137,7 @@ def drift(
 
 @dataclass(frozen=True)
 class Outage:
-    """Growth of the position error while GPS was silent; growth_percent is None where nothing was travelled.
+    """Growth of the position error while GPS was silent; growth_percent is None if the distance is zero.
 
     Attributes:
         begin_ns, end_ns: the poses compared: the first at or after the last reading, and the last before the next.
@@ -159,19 +163,18 @@ def outage_drift(
 ) -> tuple[Outage, ...]:
     """Drift within each GPS outage: the growth of the error vector over the distance travelled meanwhile.
 
-    An outage is a time without GPS longer than min_outage_s; so are the time before the first reading and after
-    the last, and the whole log where there is none. The pose at the next reading's own time does not count: it may
-    have used that reading.
+    An outage is a time without GPS longer than min_outage_s. The time before the first reading and the time after the
+    last count too, and so does the whole log if it has no reading. The pose at the time of the next reading is not
+    used: it may have used that reading.
 
     Args:
         truth, estimate, tolerance_ns: as for `ate`; nothing is aligned.
-        gps_t_ns: (k,) when readings came (their reception, where that differs), any order; those outside the
-            trajectory are passed over.
+        gps_t_ns: (k,) times of reception of the readings, any order; those outside the trajectory are ignored.
         min_outage_s: s.
         dims: as for `drift`.
 
     Returns:
-        One for each outage with at least two poses in it, in time order; empty where GPS was never silent.
+        One for each outage with at least two poses in it, in time order; empty if GPS was never silent.
 
     Raises:
         ScoreError: as `ate`.

@@ -1,4 +1,4 @@
-"""Moving an estimate onto the truth before they are compared: a step of its own, because it changes every number."""
+"""Alignment of an estimate with the truth: a step of its own, because it changes every score."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from .pose_error import positions
 Alignment: TypeAlias = Literal["none", "origin", "yaw", "se3"]
 
 DEGENERATE = 1e-12
-"""What is this small beside what it is computed from is rounding, not geometry."""
+"""Relative: a value this small compared with its inputs is rounding, not geometry."""
 
 
 def align(truth: Trajectory, estimate: Trajectory, mode: Alignment = "none") -> Trajectory:
     """Return the estimate moved from its own world V into the truth's W: p_WB_W = R_WV p_VB_V + p_WV_W.
 
-    Attitude, position and velocity are moved; biases and P are left as they are. P's position and velocity are then
-    still in V's axes: judge covariances (`nees`) on the estimate itself.
+    Attitude, position and velocity are moved; biases and P are not. P's position and velocity are then still in V's
+    axes, so covariances must be judged (`nees`) on the estimate before alignment.
 
     Args:
         truth, estimate: associated, n rows each.
-        mode: what the estimator is forgiven.
-            "none": nothing.
-            "origin": where it started: T_WV = T_WB,0 T_VB,0⁻¹. Needs the truth's first attitude.
-            "yaw": the four degrees of freedom that dead reckoning cannot observe, a rotation about the vertical and
-                a translation, of least squared position error. Without a vertical truth the heights stay.
-            "se3": the rotation and translation of least squared position error.
+        mode: the transform that is estimated.
+            "none": the identity.
+            "origin": from the first pose: T_WV = T_WB,0 T_VB,0⁻¹. Needs the truth's first attitude.
+            "yaw": a rotation about the vertical and a translation, the four degrees of freedom that dead reckoning
+                cannot observe, with the least squared position error. Without heights in the truth, heights stay.
+            "se3": the rotation and translation with the least squared position error.
 
     Raises:
-        ScoreError: not associated, not finite, or the transform is not determined: too few poses, none moved, all on
+        ScoreError: not associated, not finite, or the transform is not determined: too few poses, no motion, all on
             one line ("se3"), or no attitude ("origin").
 
     Source: Umeyama 1991, eqs. (38)-(41), scale 1; Zhang & Scaramuzza 2018, "A tutorial on quantitative trajectory
@@ -45,7 +45,7 @@ def align(truth: Trajectory, estimate: Trajectory, mode: Alignment = "none") -> 
     if mode == "none":
         return estimate
     if mode not in _TRANSFORM:
-        raise ScoreError(f"alignment: no mode {mode!r}; there are none, {', '.join(_TRANSFORM)}")
+        raise ScoreError(f"alignment: no mode {mode!r}; known: none, {', '.join(_TRANSFORM)}")
     positions(truth, estimate, "2d")  # refuses what is not finite
     R_WV, p_WV_W = _TRANSFORM[mode](truth, estimate)
     return replace(
@@ -96,7 +96,7 @@ _TRANSFORM = {"origin": _origin, "yaw": _yaw, "se3": _se3}
 
 
 def _centred(p: Array) -> Array:
-    """Return p (n, k) from its mean; exactly zero where nothing but rounding is left."""
+    """Return p (n, k) less its mean; exactly zero if only rounding is left."""
     x = p - p.mean(axis=0)
     return x if np.abs(x).max() > DEGENERATE * np.abs(p).max() else np.zeros_like(x)
 

@@ -1,4 +1,4 @@
-"""Which row of the estimate is compared with which row of the truth."""
+"""Association: which row of the estimate is compared with which row of the truth."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from ...datasets.trajectory import Trajectory
 
 
 class ScoreError(ValueError):
-    """A score is not defined for these trajectories; says why and what to do. To a table, the score is absent."""
+    """A score is not defined for these trajectories; the message says why and what to do. Tables leave it out."""
 
 
 def associate(truth: Trajectory, estimate: Trajectory, tolerance_ns: int = 0) -> tuple[Trajectory, Trajectory]:
-    """Return the rows of both that belong together, equally many, each with its own times.
+    """Return the matching rows of both, equally many, each with its own times.
 
     Args:
         truth, estimate: any lengths.
         tolerance_ns: 0 pairs equal times only. Otherwise each row is paired with its nearest in time, provided it
-            is nearest to that one too and no further than this; so no row is used twice. Of two equally near,
-            the estimate after the truth is taken.
+            is in turn the nearest to that one, and no further than this; so no row is used twice. Of two equally
+            near estimates, the later one is taken.
 
     Raises:
         ScoreError: nothing matches, or the tolerance is negative.
@@ -35,7 +35,8 @@ def associate(truth: Trajectory, estimate: Trajectory, tolerance_ns: int = 0) ->
     if len(rows_true) == 0:
         raise ScoreError(
             f"association: no truth within {tolerance_ns} ns of any estimate: truth has {_span(truth)}, estimate has "
-            f"{_span(estimate)}; sample both at the same times, mend the clock offset, or allow a larger tolerance_ns"
+            f"{_span(estimate)}; sample both at the same times, correct the clock offset, or allow a larger "
+            "tolerance_ns"
         )
     return truth.select(rows_true), estimate.select(rows_est)
 

@@ -1,11 +1,11 @@
-"""Is the error as large as the covariance says? Over seeds, at times fixed beforehand, against the chi-square interval.
+"""Consistency over seeds: ANEES at times fixed beforehand, and NIS, with their chi-square intervals.
 
-The errors of a consistent estimator are correlated in time, so an average over time is not chi-square, and an interval
-that takes it for that raises false alarms. Averages over seeds are, time by time: N seeds of a block with d degrees of
+Errors of one run are correlated in time, so their average over time is not chi-square, and an interval for it would
+raise false alarms. Over seeds they are independent: at one time, the NEES of N seeds of a block with d degrees of
 freedom sum to chi-square with N d. The interval at each of n times has probability 1 − FALSE_ALARM / n, so that all n
-together, one line of a figure, raise a false alarm at most once in 1/FALSE_ALARM; a table of 100 such once in ten.
+together (one line of a figure) raise a false alarm at most once in 1 / FALSE_ALARM, and 100 such lines once in ten.
 
-Innovations are white, so their NIS may be pooled over time and seeds alike.
+Innovations are white, so NIS may be pooled over time as well as over seeds. See docs/conventions.md (55) and (56).
 
 Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.
 """
@@ -30,18 +30,19 @@ from .association import ScoreError, associate
 from .state_error import BLOCKS, DOF, Block, nees
 
 FALSE_ALARM = 1e-3
+"""Probability that a consistent estimator leaves the interval at any of the times."""
 
 
 @dataclass(frozen=True, eq=False)
 class Average:
-    """Averages of something that is chi-square over its degrees of freedom, and where an honest one lies.
+    """Averages of chi-square variables over their degrees of freedom, with the interval of a consistent estimator.
 
     Attributes:
-        t_s: (n,) from the start of the log; NaN for what is pooled over time.
-        runs: (n,) how many seeds are in each.
-        dof: (n,) degrees of freedom, of all of them together.
-        value: (n,) the averages, by degree of freedom: 1 is honest.
-        low, high: (n,) their interval.
+        t_s: (n,) from the start of the log; NaN for an average over time.
+        runs: (n,) seeds in each average.
+        dof: (n,) degrees of freedom of all seeds together.
+        value: (n,) averages per degree of freedom; 1 is consistent.
+        low, high: (n,) the interval.
     """
 
     t_s: Array
@@ -56,30 +57,30 @@ class Average:
 
     @property
     def above(self) -> NDArray[np.bool_]:
-        """Which errors are larger than the covariance says: overconfidence."""
+        """Where errors are larger than the covariance says: overconfident."""
         return self.value > self.high
 
     @property
     def below(self) -> NDArray[np.bool_]:
-        """Which errors are smaller than the covariance says: modesty."""
+        """Where errors are smaller than the covariance says: underconfident."""
         return self.value < self.low
 
 
 def nees_at(log: Log, estimate: Trajectory, epochs: int) -> dict[str, list[float | None]]:
     """Return the NEES of each block at times fixed beforehand, with those times.
 
-    The times are the middles of `epochs` equal parts of the log, whatever the estimate. Each takes the pose of its part
-    that is nearest (of two, the earlier) and has a covariance; so a smoother that keeps few covariances with hindsight
-    has fewer times.
+    The times are the middles of `epochs` equal parts of the log and do not depend on the estimate. For each, the
+    nearest pose of its part with a covariance is used (of two, the earlier). A smoother that keeps few covariances has
+    fewer times.
 
     Args:
-        log: its truth must be one, and known.
-        estimate: unaligned.
-        epochs: how many times.
+        log: with a truth that is not a reference.
+        estimate: not aligned.
+        epochs: number of times.
 
     Returns:
         "t_s" of the poses, from the start of the log, and a list per block of BLOCKS, None where there is no such pose
-        or its truth is unknown; without the blocks that `nees` refuses, and empty where there is no covariance at all.
+        or its truth is unknown. Blocks that `nees` refuses are left out; without any covariance it is empty.
     """
     assert log.truth is not None
     try:
@@ -108,7 +109,7 @@ def nees_at(log: Log, estimate: Trajectory, epochs: int) -> dict[str, list[float
 
 
 def _spread(values: Mapping[int, float], n: int) -> list[float | None]:
-    """Return n places with these values in theirs; None for what is not there or NaN."""
+    """Return a list of n with these values at their keys, and None for a missing value or NaN."""
     return [None if np.isnan(value := values.get(k, np.nan)) else value for k in range(n)]
 
 
@@ -120,10 +121,10 @@ def interval(dof: Array | NDArray[np.int64], probability: float) -> tuple[Array,
 
 
 def anees(values: Array, dof: int, t_s: Array) -> Average:
-    """Average NEES over seeds, time by time.
+    """Average NEES over seeds, time by time; docs/conventions.md (55).
 
     Args:
-        values: (N, n) of N seeds at n times; NaN where a seed has none.
+        values: (N, n) of N seeds at n times; NaN for a missing one.
         dof: of one value.
         t_s: (n,) the times.
     """
@@ -135,10 +136,10 @@ def anees(values: Array, dof: int, t_s: Array) -> Average:
 
 
 def anees_of(runs: Sequence[str | None]) -> dict[Block, Average]:
-    """Average over seeds what `nees_at` returned, as the store has it (JSON); blocks that no run has are left out."""
+    """Average the results of `nees_at` over seeds, given as JSON from the store; blocks without a run are left out."""
     every: list[dict[str, list[float | None]]] = [of_run for run in runs if run and (of_run := json.loads(run))]
     usual = Counter(len(run["t_s"]) for run in every).most_common(1)
-    every = [run for run in every if len(run["t_s"]) == usual[0][0]]  # a run that was asked for other times is left out
+    every = [run for run in every if len(run["t_s"]) == usual[0][0]]  # leaves out runs with another number of times
     found: dict[Block, Average] = {}
     for block in BLOCKS:
         of_block = [run for run in every if block in run]
@@ -150,7 +151,7 @@ def anees_of(runs: Sequence[str | None]) -> dict[Block, Average]:
 
 
 def pooled_nis(runs: Sequence[Mapping[str, Any]]) -> dict[str, Average]:
-    """Pool the NIS of each sensor over time and over runs, rows of the store; sensors that none has are left out."""
+    """Pool the NIS of each sensor over time and runs (rows of the store); sensors without NIS are left out."""
     total: dict[str, list[tuple[float, int]]] = {}
     for run in runs:
         for sensor, dof in json.loads(run["nis_dof"] or "{}").items():

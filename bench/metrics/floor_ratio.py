@@ -1,4 +1,4 @@
-"""How near an estimator comes to the floor: its RMSE over the floor's own, with a bootstrap interval over seeds."""
+"""An estimator's RMSE over the floor, with a bootstrap interval over seeds; docs/conventions.md (61)."""
 
 from __future__ import annotations
 
@@ -20,29 +20,28 @@ FLOORS = {
     "floor_attitude_deg": "floor of the rotation angle's, °",
     "floor_velocity_m_s": "floor of the velocity error's, m/s",
 }
-"""Only of simulated logs, and where `floor` is asked for."""
+"""Only for simulated logs, and if `floor` is set."""
 
 OVER = {
     "position": ("ate_rmse_m", "floor_position_m"),
     "attitude": ("rotation_rmse_deg", "floor_attitude_deg"),
     "velocity": ("velocity_rmse_m_s", "floor_velocity_m_s"),
 }
-"""Which score stands over which floor, by block."""
-
+"""The score and its floor, by block."""
 
 FEWEST_SEEDS = 5
-"""With fewer, the bootstrap's 95 % interval holds the truth in half to three quarters of cases; with 20, in 91 %."""
+"""With fewer, the bootstrap's 95 % interval contains the truth in half to three quarters of cases; with 20, in 91 %."""
 
 
 @dataclass(frozen=True)
 class FloorRatio:
-    """An estimator's RMSE over the floor's; 1 for the best there can be.
+    """An estimator's RMSE over the floor; 1 is the best possible.
 
     Attributes:
-        ratio: of the root of the mean squared error to that of the mean bound.
+        ratio: root of the mean squared error over root of the mean bound.
         low, high: bootstrap interval; None with fewer than FEWEST_SEEDS.
         level: of the interval.
-        seeds: how many runs.
+        seeds: number of runs.
     """
 
     ratio: float
@@ -53,26 +52,26 @@ class FloorRatio:
 
 
 def squares(truth: Trajectory, estimate: Trajectory, floor: Floor, block: slice) -> tuple[float, float]:
-    """Return, of one run, the mean squared error of a block of the state, and its floor: the mean trace of the bound.
+    """Return the mean squared error of a block of the state in one run, and its floor: the mean trace of the bound.
 
     Args:
-        truth, estimate, floor: those rows of the three count that have one time.
+        truth, estimate, floor: rows at times that all three have are used.
         block: of the error state, in one unit: THETA, POSITION, ... of `fathom.datasets.state`.
 
     Raises:
-        ScoreError: the estimate looks ahead by another time than the floor, it diverged, no times match, or it or the
-            truth does not know the block.
+        ScoreError: estimate and floor have different look-ahead, the estimate diverged, no times match, or the error
+            of the block is unknown.
     """
     if estimate.lookahead_s != floor.lookahead_s:
         raise ScoreError(
             f"floor: the estimate looks {estimate.lookahead_s:g} s ahead and the floor {floor.lookahead_s:g} s; "
-            "ask `floors` for the same"
+            "compute `floors` for the same look-ahead"
         )
     truth, estimate = associate(truth, estimate)
     check_finite(estimate)
     _, rows, floor_rows = np.intersect1d(estimate.t_ns, floor.t_ns, assume_unique=True, return_indices=True)
     if len(rows) == 0:
-        raise ScoreError("floor: it has none of the estimate's times; ask `floors` for those")
+        raise ScoreError("floor: it has none of the estimate's times; compute `floors` at those")
     e = error_state(truth, estimate)[rows, block]
     if np.isnan(e).any():
         raise ScoreError("floor: the error of this block is not known")
@@ -81,7 +80,7 @@ def squares(truth: Trajectory, estimate: Trajectory, floor: Floor, block: slice)
 
 
 def floor_scores(floor: Floor, t_ns: TimeArray) -> dict[str, float | None]:
-    """Return every score of FLOORS by name, over the poses at t_ns; None where the floor does not have them all."""
+    """Return every score of FLOORS by name, over the poses at t_ns; None if the floor lacks one of them."""
     rows = np.isin(floor.t_ns, t_ns)
     if rows.sum() < len(t_ns):
         return dict.fromkeys(FLOORS)
@@ -95,26 +94,26 @@ def rmse_over_floor(
 ) -> FloorRatio:
     """Return the ratio of root means over seeds, √(mean squared error / mean bound), and its interval.
 
-    The interval is a bootstrap over seeds, error and bound of a seed staying together; bias-corrected and accelerated
-    (BCa), for the ratio is skewed and seeds are few.
+    The interval is a bootstrap over seeds that keeps error and bound of a seed together. It is bias-corrected and
+    accelerated (BCa), because the ratio is skewed and seeds are few.
 
     Args:
-        squared_error, floor_variance: (n,), of each seed, as `squares` returns them.
+        squared_error, floor_variance: (n,), one per seed, from `squares`.
         level: of the interval, between 0 and 1.
         resamples, seed: of the bootstrap.
 
     Raises:
-        ScoreError: no seeds, a number that is not finite, or a floor that is not positive.
+        ScoreError: no seeds, a value that is not finite, or a floor that is not positive.
 
     Source: Efron 1987, doi:10.1080/01621459.1987.10478410.
     """
     e, f = np.asarray(squared_error, np.float64), np.asarray(floor_variance, np.float64)
     if len(e) == 0 or e.shape != f.shape or not (np.isfinite(e).all() and np.isfinite(f).all() and f.min() > 0):
-        raise ScoreError("floor: a ratio needs at least one seed, and of each a finite error and a positive bound")
+        raise ScoreError("floor: a ratio needs at least one seed, with a finite error and a positive bound for each")
     ratio = float(_ratio(e, f))
     if len(e) < FEWEST_SEEDS:
         return FloorRatio(ratio, None, None, level, len(e))
-    if np.ptp(e / f) <= 1e-12 * ratio**2:  # every resample says the same
+    if np.ptp(e / f) <= 1e-12 * ratio**2:  # all resamples are equal
         return FloorRatio(ratio, ratio, ratio, level, len(e))
     interval = scipy.stats.bootstrap(
         (e, f), _ratio, paired=True, vectorized=True, n_resamples=resamples, batch=1000, confidence_level=level,

@@ -1,4 +1,4 @@
-"""The error of a pose, and what is said about many of them."""
+"""Errors of poses, and their statistics."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from ...datasets.trajectory import Trajectory
 from .association import ScoreError
 
 Dims: TypeAlias = Literal["3d", "2d"]
-"""Whether positions count in space or in the horizontal plane only."""
+"""Whether position errors are taken in space or in the horizontal plane."""
 
 
 def positions(truth: Trajectory, estimate: Trajectory, dims: Dims) -> tuple[Array, Array]:
     """Return p_WB_W of both, (n, 3) m, or (n, 2) with dims "2d".
 
     Raises:
-        ScoreError: no such dims, or a truth without them (a GPS buoy knows no vertical: its z is NaN), or an
-            estimate that is not finite.
+        ScoreError: unknown dims, a truth without them (that of a GPS buoy has no height: its z is NaN), or an estimate
+            that is not finite.
     """
     if dims not in ("3d", "2d"):
         raise ScoreError(f"dims must be '3d' or '2d', found {dims!r}")
@@ -29,7 +29,7 @@ def positions(truth: Trajectory, estimate: Trajectory, dims: Dims) -> tuple[Arra
     p_true, p_est = truth.p_WB_W[:, : int(dims[0])], estimate.p_WB_W[:, : int(dims[0])]
     unknown = ~np.isfinite(p_true).all(axis=1)
     if unknown.any():
-        way_out = "drop such rows" if np.isnan(truth.p_WB_W[:, :2]).any() else "dims='2d' scores the horizontal"
+        way_out = "drop such rows" if np.isnan(truth.p_WB_W[:, :2]).any() else "dims='2d' scores the horizontal only"
         raise ScoreError(f"{dims} positions: the truth is unknown in {unknown.sum()} of {len(truth)} rows; {way_out}")
     return p_true, p_est
 
@@ -72,7 +72,7 @@ def _twice_sine_axis(R: Array) -> Array:
 
 
 def heading_roll_pitch(R_WB: Array) -> Array:
-    """Return (n, 3) rad: R_WB = Rz(heading) Ry(pitch) Rx(roll). Heading and roll mean nothing at a pitch of ±90°."""
+    """Return (n, 3) rad: R_WB = Rz(heading) Ry(pitch) Rx(roll). Heading and roll are undefined at a pitch of ±90°."""
     return np.stack(
         [
             np.arctan2(R_WB[:, 1, 0], R_WB[:, 0, 0]),
@@ -94,7 +94,7 @@ def travelled(p: Array) -> Array:
 
 
 def rmse(errors: Array) -> float | None:
-    """Root of the mean squared norm of errors (n,) or (n, k); rows of NaN are unknown; None where nothing is known."""
+    """Root of the mean squared norm of errors (n,) or (n, k), without rows of NaN; None if there are no others."""
     squared = (errors * errors).reshape(len(errors), -1).sum(axis=1)
     known = squared[~np.isnan(squared)]
     return float(np.sqrt(known.mean())) if len(known) else None
@@ -103,7 +103,7 @@ def rmse(errors: Array) -> float | None:
 def statistics(errors: Array, name: str) -> dict[str, float | None]:
     """Return rmse, mean, median, std, min, max of errors (n,), each under `name` with its {} filled in.
 
-    NaN is unknown and left out; where nothing is known, all are None.
+    NaN is left out; if there is nothing else, all are None.
     """
     known = errors[~np.isnan(errors)]
     values: dict[str, float | None] = dict.fromkeys(("rmse", "mean", "median", "std", "min", "max"))
@@ -123,8 +123,8 @@ def pooled_rmse(rmses: Sequence[float], counts: Sequence[int]) -> float:
     """RMSE over several runs: sqrt(Σ n_k rmse_k² / Σ n_k); squared errors are pooled before the root.
 
     Args:
-        rmses: of each run, any unit.
-        counts: how many errors each was taken over.
+        rmses: one per run, any unit.
+        counts: the number of errors in each.
 
     Raises:
         ScoreError: not one count for each RMSE, a negative count, or none at all.

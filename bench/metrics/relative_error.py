@@ -1,4 +1,4 @@
-"""How wrong the motion between two moments is: RPE over a step, and errors over sub-trajectories of given lengths."""
+"""Relative errors: RPE over a step, and errors over sub-trajectories of given lengths."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Pairs: TypeAlias = Literal["consecutive", "all"]
 RowPairs: TypeAlias = tuple[TimeArray, TimeArray]
 
 STEP_TOLERANCE = 0.1
-"""How far a step may be from delta, relative to it."""
+"""Relative: a step may differ from delta by this; evo's rel_delta_tol has the same default."""
 
 LONGEST_STEP = 1e9
-"""Frames, s or m; so that nanoseconds fit int64."""
+"""Frames, s or m: nanoseconds of more would not fit int64."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ def rpe(
 ) -> Rpe:
     """Relative pose error: |trans E| and the angle of E, E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Q the truth, P the estimate.
 
-    No alignment changes it. Pairs (i, j) are chosen on the truth, so that every estimate answers the same questions:
+    It does not depend on alignment; docs/conventions.md (52). Pairs (i, j) are chosen on the truth, so that they are
+    the same for every estimate:
 
     | unit | consecutive, from i = 0, then from the last j | all, from every i |
     | --- | --- | --- |
@@ -66,8 +67,8 @@ def rpe(
     | s | the first j with t_j − t_i >= delta; left out if over 10 % late | likewise |
     | m | the first j at least delta further on the path | the j nearest to delta on it; left out if over 10 % off |
 
-    Frames and metres are as evo chooses them (pairs_from_reference, rel_delta_tol 0.1), evo's consecutive metres having
-    no tolerance; evo knows no seconds.
+    Pairs by frames and by metres are evo's (pairs_from_reference, rel_delta_tol 0.1); evo's consecutive metres have no
+    tolerance, and evo has no seconds.
 
     Args:
         truth, estimate, tolerance_ns: as for `ate`. Pairs with an unknown attitude are left out.
@@ -77,7 +78,7 @@ def rpe(
 
     Raises:
         ScoreError: no such pair (the truth is shorter than delta, or too sparse), bad arguments, or no attitude, which
-            a relative pose cannot do without.
+            a relative pose needs.
 
     Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", eqs. (1)-(2).
     """
@@ -106,7 +107,7 @@ def rpe(
 
 @dataclass(frozen=True)
 class SegmentError:
-    """Errors over the n sub-trajectories of one length: translation in % of the way, rotation in °/m."""
+    """Errors over the n sub-trajectories of one length: translation in % of the distance, rotation in °/m."""
 
     length_m: float
     n: int
@@ -133,15 +134,15 @@ def segment_errors(
 ) -> dict[float, SegmentError]:
     """Relative errors over sub-trajectories: from every pose i to the first pose j at or past the length, on the truth.
 
-    The error E is that of `rpe`. Where we depart from KITTI: each is divided by the way from i to j itself, which is a
-    little longer than the nominal length, and every pose starts one, not every tenth.
+    The error E is that of `rpe`. Two differences from KITTI: each error is divided by the distance from i to j, which
+    is a little longer than the nominal length; and every pose starts a sub-trajectory, not every tenth.
 
     Args:
         truth, estimate, tolerance_ns, dims: as for `rpe`.
         lengths_m: positive.
 
     Returns:
-        By length; a length that the truth never covers is absent.
+        By length; a length that the truth does not cover is absent.
 
     Raises:
         ScoreError: nothing to compare, a length that is not positive, or no attitude.
@@ -171,7 +172,7 @@ def segment_errors(
 
 
 def _error_rotation(truth: Trajectory, estimate: Trajectory) -> Array:
-    """D_k = R_est,k R_true,kᵀ (n, 3, 3), the error of the attitude seen in W; NaN where unknown."""
+    """D_k = R_est,k R_true,kᵀ (n, 3, 3), the error of the attitude in W; NaN where unknown."""
     return estimate.R_WB @ truth.R_WB.transpose(0, 2, 1)
 
 
@@ -180,7 +181,7 @@ def _relative_errors(
 ) -> tuple[Array, Array, RowPairs]:
     """Return |trans E| (m) and the angle of E (rad), both (k,), and the pairs (i, j) whose attitudes are known.
 
-    The rotation of E is D_iᵀ D_j seen from another frame, and its translation, turned into W, is
+    The rotation of E is D_iᵀ D_j in another frame, with the same angle. Its translation, in W, is
     D_iᵀ (p_est,j − p_est,i) − (p_true,j − p_true,i).
     """
     known = ~np.isnan(D[:, 0, 0])
@@ -195,7 +196,7 @@ def _relative_errors(
 
 
 def check_step(delta: float, unit: Unit) -> None:
-    """Raise ScoreError where no pair of poses can be delta apart."""
+    """Raise ScoreError if no pair of poses can be delta apart."""
     if not (0 < delta <= LONGEST_STEP) or (unit == "frames" and delta != int(delta)):
         raise ScoreError(
             f"rpe: delta must be positive, at most {LONGEST_STEP:g}, and whole in frames; found {delta} {unit}"
@@ -237,7 +238,7 @@ def _nearest_on_path(path_m: Array, delta_m: float) -> RowPairs:
 
 
 def _chain(steps: Array | TimeArray, delta: float) -> RowPairs:
-    """Pair 0 with the first row at least delta on, that row with the next such, and so on; steps (n − 1,) >= 0."""
+    """Pair row 0 with the first row at least delta further, that row with the next, and so on; steps (n − 1,) >= 0."""
     rows, gone = [0], 0
     for row, step in enumerate(steps.tolist(), 1):
         gone += step

@@ -1,4 +1,4 @@
-"""The scores by name, how they are asked for, and all of them for one trajectory."""
+"""The names of the scores, how to ask for them, and all of them for one trajectory."""
 
 from __future__ import annotations
 
@@ -13,28 +13,13 @@ from ...datasets.epochs import SENSOR
 from ...datasets.log import Log
 from ...datasets.quantities import Positive
 from ...datasets.trajectory import Trajectory
-from . import (
-    BLOCKS,
-    Alignment,
-    Dims,
-    Pairs,
-    ScoreError,
-    Unit,
-    align,
-    associate,
-    ate,
-    check_step,
-    coverage,
-    drift,
-    horizontal_error,
-    nees,
-    not_positive,
-    outage_drift,
-    rpe,
-    segment_errors,
-    state_errors,
-)
+from .absolute_error import ate, drift, horizontal_error, outage_drift
+from .alignment import Alignment, align
+from .association import ScoreError, associate
 from .floor_ratio import FLOORS
+from .pose_error import Dims
+from .relative_error import Pairs, Unit, check_step, rpe, segment_errors
+from .state_error import BLOCKS, coverage, nees, not_positive, state_errors
 
 SCORES = {
     "n_scored": "poses compared",
@@ -57,26 +42,26 @@ SCORES = {
     "outage_percent": "worst growth of the horizontal error in a GPS outage, % of the distance travelled in it",
     "cep50_m": "median horizontal error, m",
     "drms_m": "root mean square of the horizontal error, m",
-    "nees_position": "mean NEES of position over the ticks; 3 when the covariance is honest",
-    "nees_attitude": "mean NEES of attitude; 3 when honest",
-    "nees_velocity": "mean NEES of velocity; 3 when honest",
-    "nees_biases": "mean NEES of both biases; 6 when honest",
-    "nees_all": "mean NEES of the whole state; 15 when honest",
-    "within_1sigma_position": "share of the components of position that err by at most 1 σ; 0.683 when honest",
-    "within_2sigma_position": "the same within 2 σ; 0.954 when honest",
-    "within_3sigma_position": "the same within 3 σ; 0.997 when honest",
-    "within_1sigma_all": "share of all 15 components that err by at most 1 σ; 0.683 when honest",
-    "within_2sigma_all": "the same within 2 σ; 0.954 when honest",
-    "within_3sigma_all": "the same within 3 σ; 0.997 when honest",
-    "n_not_positive": "poses whose covariance is not positive definite; their NEES is then absent",
+    "nees_position": "mean NEES of position over the log; 3 if consistent",
+    "nees_attitude": "mean NEES of attitude; 3 if consistent",
+    "nees_velocity": "mean NEES of velocity; 3 if consistent",
+    "nees_biases": "mean NEES of both biases; 6 if consistent",
+    "nees_all": "mean NEES of the whole state; 15 if consistent",
+    "within_1sigma_position": "share of position components with an error of at most 1 σ; 0.683 if consistent",
+    "within_2sigma_position": "the same within 2 σ; 0.954 if consistent",
+    "within_3sigma_position": "the same within 3 σ; 0.997 if consistent",
+    "within_1sigma_all": "share of all 15 components with an error of at most 1 σ; 0.683 if consistent",
+    "within_2sigma_all": "the same within 2 σ; 0.954 if consistent",
+    "within_3sigma_all": "the same within 3 σ; 0.997 if consistent",
+    "n_not_positive": "poses whose covariance is not positive definite; these have no NEES",
 }
 
 
 INNOVATIONS = {
-    f"nis_{sensor}": f"NIS of the {sensor} readings that came in time, by degree of freedom: mean; 1 when honest"
+    f"nis_{sensor}": f"NIS of the {sensor} readings that came in time, mean per degree of freedom; 1 if consistent"
     for sensor in dict.fromkeys(SENSOR)
 }
-"""Only where `nis` is asked for, and of what was said online."""
+"""Only where `nis` is asked for, and of the online output."""
 
 
 COSTS = {
@@ -86,9 +71,9 @@ COSTS = {
     "belief_median_us": "time of one belief: median, µs",
     "finish_s": "time of finish, s",
     "total_s": "time of all steps and finish, s",
-    "real_time_factor": "length of the log over total_s",
-    "us_per_imu_sample": "total_s over IMU samples, µs",
-    "peak_mb": "peak memory of the run over that before it, MB",
+    "real_time_factor": "length of the log divided by total_s",
+    "us_per_imu_sample": "total_s divided by the number of IMU samples, µs",
+    "peak_mb": "peak memory of the run above the memory before it, MB",
 }
 
 
@@ -97,14 +82,14 @@ class Scoring:
     """How a trajectory is scored.
 
     Attributes:
-        align: what the estimator is forgiven, see `fathom.bench.metrics.align`; printed with the number.
+        align: how the estimate is aligned first, see `fathom.bench.metrics.align`; printed with the number.
         dims: "2d" counts horizontal positions only, in ATE, RPE and sub-trajectories; drift is always horizontal.
         rpe_delta, rpe_unit, rpe_pairs: see `fathom.bench.metrics.rpe`.
         segment_lengths_m: of the sub-trajectories.
-        score_period_s: beliefs are asked for this far apart; 1 ms or more.
-        nees_epochs: at how many times, evenly spaced over the log, NEES is averaged over the seeds (see `consistency`).
-        nis: judge the estimators by their innovations, see `run_log`; their costs are then not to be compared.
-        floor: find the posterior Cramér–Rao bound of every output; of simulated logs, unaligned and in 3d.
+        score_period_s: time between two scored beliefs; 1 ms or more.
+        nees_epochs: number of evenly spaced times at which NEES is averaged over seeds (see `consistency`).
+        nis: take the NIS of innovations, see `run_log`; costs are then not comparable.
+        floor: compute the posterior Cramér–Rao bound of every output, for simulated logs, unaligned and in 3d.
     """
 
     align: Alignment = "none"
@@ -127,7 +112,7 @@ class Scoring:
 def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict[str, float | None]:  # noqa: B008
     """Return every score of SCORES by name; None where it is not defined for this log and estimate.
 
-    Covariances are judged only where `can_judge` says so.
+    Consistency is scored only where `can_judge` holds.
     """
     row: dict[str, float | None] = dict.fromkeys(SCORES)
     if log.truth is None:
@@ -142,17 +127,17 @@ def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict
         with suppress(ScoreError):
             row |= part(log, truth, aligned, scoring)
     if can_judge(log, scoring):
-        row |= _honesty(truth, estimate)
+        row |= _consistency(truth, estimate)
     return row
 
 
 def can_judge(log: Log, scoring: Scoring) -> bool:
-    """Return whether covariances can be judged: where nothing is aligned, and the truth is one."""
+    """Return whether consistency can be scored: against ground truth, without alignment."""
     return log.truth is not None and log.truth_kind == "truth" and scoring.align == "none"
 
 
-def _honesty(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
-    """Return NEES and coverage; what cannot be had of one block (an unknown truth, a P that is none) is absent."""
+def _consistency(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
+    """Return NEES and coverage; absent for a block without truth, or without a valid covariance."""
     row: dict[str, float | None] = {}
     for block in BLOCKS:
         with suppress(ScoreError):
@@ -225,7 +210,7 @@ POOLED = {
     "drms_m": "n_scored",
     **dict.fromkeys(FLOORS, "n_scored"),
 }
-"""Root mean squares are pooled over seeds before the root, each with its own count."""
+"""Scores whose squares are pooled over seeds before the root, and the score that holds the weight of each."""
 
 
 MEAN = (
@@ -236,6 +221,8 @@ MEAN = (
     "cep50_m",
     *(name for name in SCORES if name.startswith(("nees_", "within_"))),
 )
+"""Scores of which the mean over seeds is taken."""
 
 
 MEDIAN = ("step_median_us", "step_p99_us", "real_time_factor", "us_per_imu_sample", "peak_mb")
+"""Scores of which the median over seeds is taken: their outliers are the machine's."""

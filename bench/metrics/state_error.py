@@ -1,4 +1,4 @@
-"""Errors of the whole state, heading to biases, and whether the covariance owns up to them: NEES and coverage."""
+"""Errors of the whole state, from heading to biases, and the consistency of their covariance: NEES and coverage."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DOF: dict[Block, int] = {block: of.stop - of.start for block, of in BLOCKS.items
 
 @dataclass(frozen=True)
 class StateErrors:
-    """RMSE of each part of the state over n poses; vectors by their norm; None where truth or estimate know it not."""
+    """RMSE of each part of the state over n poses; vectors by their norm; None if truth or estimate lack it."""
 
     heading_deg: float | None
     roll_deg: float | None
@@ -62,7 +62,9 @@ def state_errors(truth: Trajectory, estimate: Trajectory, tolerance_ns: int = 0)
 
 
 def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tolerance_ns: int = 0) -> Array:
-    """Normalised estimation error squared, eᵀ P⁻¹ e, with estimate ⊕ e = truth; of an honest estimate, χ² on average.
+    """Normalised estimation error squared, eᵀ P⁻¹ e, with estimate ⊕ e = truth; χ² for a consistent estimate.
+
+    See docs/conventions.md (54).
 
     Args:
         truth, estimate, tolerance_ns: as for `ate`; nothing is aligned.
@@ -72,7 +74,7 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
         (n,) for the n associated rows; NaN where P or the truth is.
 
     Raises:
-        ScoreError: no such block, the estimate has no P, part of the block is unknown in every row, or a P is not
+        ScoreError: unknown block, the estimate has no P, part of the block is unknown in every row, or a P is not
             positive definite.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2; e in the coordinates of `fathom.datasets.state`.
@@ -90,7 +92,7 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
 
 
 def _solve_lower(L: Array, e: Array) -> Array:
-    """Return w (n, k) with L w = e, row by row of e, for lower triangles L (n, k, k)."""
+    """Return w (n, k) with L w = e for each row of e, for lower triangular L (n, k, k)."""
     w = np.empty_like(e)
     for i in range(e.shape[1]):
         w[:, i] = (e[:, i] - (L[:, i, :i] * w[:, :i]).sum(axis=1)) / L[:, i, i]
@@ -100,16 +102,16 @@ def _solve_lower(L: Array, e: Array) -> Array:
 def coverage(
     truth: Trajectory, estimate: Trajectory, block: Block = "position", tolerance_ns: int = 0
 ) -> tuple[float, float, float]:
-    """Return the share of the errors' components that lie within 1, 2 and 3 of their own σ, the roots of P's diagonal.
+    """Return the share of the errors' components within 1, 2 and 3 σ, the roots of P's diagonal.
 
-    Of an honest Gaussian estimate 0.6827, 0.9545 and 0.9973 on average, whatever the correlations. Rows and components
-    where P or the truth is NaN are left out.
+    For a consistent Gaussian estimate it is 0.6827, 0.9545 and 0.9973 on average, under any correlations. Rows and
+    components where P or the truth is NaN are left out. See docs/conventions.md (57).
 
     Args:
         truth, estimate, block, tolerance_ns: as for `nees`.
 
     Raises:
-        ScoreError: as `nees`, but for a P that is not positive definite; or P is NaN in every row.
+        ScoreError: as `nees`, except for a P that is not positive definite; also if P is NaN in every row.
     """
     e, P, _ = _judged(truth, estimate, block, tolerance_ns)
     variance = np.einsum("nii->ni", P)
@@ -122,13 +124,13 @@ def coverage(
 
 
 def not_positive(estimate: Trajectory) -> TimeArray:
-    """Return the rows whose P is not positive definite, (k,); rows of NaN do not count.
+    """Return the rows whose P is not positive definite, (k,), without rows of NaN.
 
     Raises:
         ScoreError: the estimate has no P.
     """
     if estimate.P is None:
-        raise ScoreError("the estimate has no covariances; ask the estimator for them")
+        raise ScoreError("the estimate has no covariances; the estimator must be asked for them")
     rows = np.flatnonzero(~np.isnan(estimate.P).any(axis=(1, 2)))
     try:
         np.linalg.cholesky(estimate.P[rows])
@@ -149,13 +151,13 @@ def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns:
     """Return the block's errors (n, k), covariances (n, k, k) and times (n,), of the associated rows.
 
     Raises:
-        ScoreError: no such block, the estimate has no P, or part of the block is unknown in every row.
+        ScoreError: unknown block, the estimate has no P, or part of the block is unknown in every row.
     """
     if block not in BLOCKS:
-        raise ScoreError(f"nees: no block {block!r}; there are {', '.join(BLOCKS)}")
+        raise ScoreError(f"nees: no block {block!r}; known: {', '.join(BLOCKS)}")
     truth, estimate = associate(truth, estimate, tolerance_ns)
     if estimate.P is None:
-        raise ScoreError("nees: the estimate has no covariances; ask the estimator for them")
+        raise ScoreError("nees: the estimate has no covariances; the estimator must be asked for them")
     check_finite(estimate)
     of = BLOCKS[block]
     e = error_state(truth, estimate)[:, of]
@@ -168,7 +170,7 @@ def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns:
 
 
 def error_state(truth: Trajectory, estimate: Trajectory) -> Array:
-    """Return e (n, 15) with estimate ⊕ e = truth, of associated trajectories; NaN where something is unknown."""
+    """Return e (n, 15) with estimate ⊕ e = truth, of associated trajectories; NaN where unknown."""
     n = len(truth)
     e = np.empty((n, DIM))
     e[:, THETA] = rotation_vector(estimate.R_WB.transpose(0, 2, 1) @ truth.R_WB)

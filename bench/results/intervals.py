@@ -1,4 +1,4 @@
-"""How sure a number over seeds is: its bootstrap interval, the seeds being what is drawn from."""
+"""Bootstrap intervals of scores over seeds: the seeds are resampled."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
-from ..experiment.comparison import OVER_SEEDS
+from ..metrics.comparison import OVER_SEEDS
 from ..metrics.scoring import POOLED
 from .paired import FEWEST_SEEDS, TAKE, bootstrap_interval
 from .summary import Record, groups, records, summarise
 
 RESAMPLES = 1999
+"""A thousand or more are customary for such intervals; of 1999, sorted, the 50th is the end at 2.5 %."""
 TABLED = ("ate_rmse_m", "heading_rmse_deg", "drift_end_percent", "rpe_rmse_m")
 """Scores whose intervals stand in table.csv and table.tex."""
 
@@ -21,11 +22,11 @@ TABLED = ("ate_rmse_m", "heading_rmse_deg", "drift_end_percent", "rpe_rmse_m")
 def interval_over_seeds(done: Sequence[Record], score: str) -> tuple[float, float] | None:
     """Return the 95 % bootstrap interval of what `summarise` makes of a score; None with fewer than FEWEST_SEEDS seeds.
 
-    Bias-corrected and accelerated, and of percentiles for a median, as `paired.difference` has it; with few seeds it
-    is too narrow by as much as is said there.
+    Bias-corrected and accelerated, or of percentiles for a median, as in `paired.difference`, which also says how much
+    too narrow it is with few seeds.
 
     Args:
-        done: the rows of one log, estimator and output that came to their end.
+        done: the rows of one log, estimator and output that finished.
         score: one of `paired.OVER_SEEDS`.
     """
     known = [row for row in done if row[score] is not None]

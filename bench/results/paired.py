@@ -1,6 +1,6 @@
-"""Two variants on the same logs: how much they differ, how sure that is, and by how much chance would.
+"""Paired differences of two variants on the same logs, with bootstrap intervals and tests over seeds.
 
-A seed's log is the same for all variants, so a seed's two scores belong together, and the seeds are what is drawn from.
+All variants run on the same log of a seed, so the two scores of a seed are a pair, and the pairs are resampled.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ import pandas as pd
 import scipy  # its stats load when they are first asked for
 
 from ...datasets.state import Array
-from ..experiment.comparison import OVER_SEEDS, Comparison, Over
 from ..metrics.association import ScoreError
+from ..metrics.comparison import OVER_SEEDS, Comparison, Over
 from ..metrics.scoring import POOLED
 from .summary import Record, groups, records
 
 FEWEST_SEEDS = 5
-"""With fewer, no interval and no test: five seeds that all agree have a p of 0.06."""
+"""With fewer there is neither interval nor test: even five seeds that all agree have a p of 0.06."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One score of a variant less its baseline's, over the seeds that both came to the end of.
+    """One score of a variant minus its baseline's, over the seeds that both finished.
 
     Attributes:
         pairs: how many seeds, or 1 for a recorded log.
-        value, baseline: the two over those seeds, taken as tables take them.
+        value, baseline: the scores of both over those seeds, pooled as in tables.
         difference: value − baseline, with a bootstrap interval over seeds, low to high.
         ratio: value / baseline, likewise; None where scores are not all positive.
-        mean_difference, median_difference: of the seeds' own differences.
-        p_wilcoxon: two-sided, of the signed-rank test of those differences: the one to judge by, see `difference`.
+        mean_difference, median_difference: of the differences seed by seed.
+        p_wilcoxon: two-sided, of the signed-rank test of those differences; the one to use, see `difference`.
         p_t: of the t test of the log ratios, for comparison.
-        rank_biserial: effect size of the signed-rank test, from −1 (less in every seed) to 1 (more in every seed).
+        rank_biserial: effect size of the signed-rank test, from −1 (lower in every seed) to 1 (higher in every seed).
         d_z: mean of the differences over their standard deviation.
     """
 
@@ -69,19 +69,20 @@ def difference(
 ) -> Difference:
     """Compare two variants, scored on the same seeds.
 
-    The interval is a bootstrap over seeds, a seed's two scores staying together; bias-corrected and accelerated (BCa),
-    and of percentiles for a median, whose jackknife tells nothing. Seeds are few: at 95 %, that of a pooled RMSE holds
-    the truth in 88 % of cases with 10 of them and in 90 % with 20, that of a mean in 92 %; a median's in 99 %.
+    The interval is a bootstrap interval over seeds; the two scores of a seed stay together. It is bias-corrected and
+    accelerated (BCa); for a median, whose jackknife is not informative, it is of percentiles. With few seeds it is too
+    narrow: at 95 % it holds the true value of a pooled RMSE in 88 % of cases with 10 seeds and in 90 % with 20, of a
+    mean in 92 %, of a median in 99 %.
 
-    The test is Wilcoxon's signed-rank test, exact up to 50 seeds without ties. All it asks is that, were there nothing
-    between the two, a seed's scores might as well be swapped; RMSEs are skewed, and one seed may go badly wrong, which
-    undoes a t test. That of log ratios, given as well, is the stronger one where ratios are log-normal. The price is
-    that n seeds cannot give a p under 2^(1 − n). Seeds without any difference are left out; where that is all, p is 1.
+    The test is Wilcoxon's signed-rank test, exact up to 50 seeds without ties. It assumes only that without an effect
+    the two scores of a seed could be swapped. RMSEs are skewed, and a single bad seed ruins a t test; the t test of log
+    ratios, given as well, has more power where ratios are log-normal. n seeds cannot give a p under 2^(1 − n). Seeds
+    without a difference are left out; if no seed has one, p is 1.
 
     Args:
         variant, baseline: (n,) scores, seed by seed.
-        over: how scores are taken over seeds; "rms" pools their squares, by `weights`.
-        weights: (n,) each, how many errors each RMSE was taken over; None for equally many.
+        over: how scores are pooled over seeds; "rms" pools their squares, by `weights`.
+        weights: (n,) each, the number of errors in each RMSE; None for equal numbers.
         level, resamples, seed: of the bootstrap.
 
     Raises:
@@ -95,26 +96,26 @@ def difference(
     n_v, n_b = (np.ones(len(v)), np.ones(len(v))) if weights is None else weights
     take = TAKE[over]
 
-    def less(v: Array, n_v: Array, b: Array, n_b: Array, axis: int = -1) -> Array:
+    def subtracted(v: Array, n_v: Array, b: Array, n_b: Array, axis: int = -1) -> Array:
         return take(v, n_v, axis) - take(b, n_b, axis)
 
-    def through(v: Array, n_v: Array, b: Array, n_b: Array, axis: int = -1) -> Array:
+    def divided(v: Array, n_v: Array, b: Array, n_b: Array, axis: int = -1) -> Array:
         return take(v, n_v, axis) / take(b, n_b, axis)
 
     data, method = (v, n_v, b, n_b), "percentile" if over == "median" else "BCa"
     positive, enough = bool((np.minimum(v, b) > 0).all()), len(v) >= FEWEST_SEEDS
     options = {"confidence_level": level, "n_resamples": resamples, "method": method, "seed": seed}
-    low, high = bootstrap_interval(data, less, **options) if enough else (None, None)
-    ratio_low, ratio_high = bootstrap_interval(data, through, **options) if enough and positive else (None, None)
+    low, high = bootstrap_interval(data, subtracted, **options) if enough else (None, None)
+    ratio_low, ratio_high = bootstrap_interval(data, divided, **options) if enough and positive else (None, None)
     d = v - b
     return Difference(
         pairs=len(v),
         value=float(take(v, n_v, -1)),
         baseline=float(take(b, n_b, -1)),
-        difference=float(less(*data)),
+        difference=float(subtracted(*data)),
         low=low,
         high=high,
-        ratio=float(through(*data)) if positive else None,
+        ratio=float(divided(*data)) if positive else None,
         ratio_low=ratio_low,
         ratio_high=ratio_high,
         mean_difference=float(d.mean()),
@@ -136,7 +137,7 @@ def signed_rank_p(d: Array) -> float:
 
 
 def t_p(x: Array) -> float | None:
-    """Return the two-sided p of the t test that the mean of x (n,) is 0; None where all x are one value but 0."""
+    """Return the two-sided p of the t test that the mean of x (n,) is 0; None where all x have one value, not 0."""
     if np.ptp(x) <= 1e-12 * np.abs(x).max():
         return None if x.any() else 1.0
     result: Any = scipy.stats.ttest_1samp(x, 0.0)
@@ -154,7 +155,7 @@ def rank_biserial(d: Array) -> float:
 
 
 def d_z(d: Array) -> float | None:
-    """Return Cohen's d of paired differences (n,), mean over standard deviation; None where they are all one value."""
+    """Return Cohen's d of paired differences (n,), mean over standard deviation; None if all are one value, not 0."""
     spread = float(d.std(ddof=1))
     if spread <= 1e-12 * float(np.abs(d).max()):
         return None if d.any() else 0.0
@@ -162,9 +163,10 @@ def d_z(d: Array) -> float | None:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return p values corrected for how many they are: rejecting below α errs anywhere with probability at most α.
+    """Return p values corrected by Holm: rejecting below α gives any false rejection with probability at most α.
 
-    Whatever depends on whatever. p̃_(i) = max over j ≤ i of min(1, (m − j + 1) p_(j)), p_(1) the smallest of m.
+    Valid under arbitrary dependence of the tests.
+    p̃_(i) = max over j ≤ i of min(1, (m − j + 1) p_(j)), p_(1) the smallest of m.
 
     Source: Holm 1979, Scandinavian Journal of Statistics 6, 65–70.
     """
@@ -184,29 +186,29 @@ TAKE: dict[Over, Callable[[Array, Array, int], Array]] = {
     "mean": lambda x, n, axis: x.mean(axis=axis),
     "median": lambda x, n, axis: np.median(x, axis=axis),
 }
-"""How scores are taken over seeds, of (scores, weights, axis)."""
+"""How scores are pooled over seeds: functions of (scores, weights, axis)."""
 
 
 def bootstrap_interval(
     data: tuple[Array, ...], statistic: Callable[..., Array], method: str, seed: int, **options: Any
 ) -> tuple[float, float]:
-    """Return the bootstrap interval of a statistic of the seeds.
+    """Return the bootstrap interval of a statistic over seeds.
 
     Args:
-        data: (n,) arrays; a seed's numbers in all of them are drawn together.
-        statistic: of such arrays, along their `axis`.
-        method: "BCa" or "percentile"; the latter also where the former has no answer.
+        data: (n,) arrays, which are resampled together, seed by seed.
+        statistic: of such arrays, along `axis`.
+        method: "BCa" or "percentile"; "percentile" also where BCa is not defined.
         seed, options: of `scipy.stats.bootstrap`.
     """
     each = np.arange(len(data[0]))
     without = np.array([statistic(*(x[each != k] for x in data)) for k in each])
     value = float(statistic(*data))
     scale = max(float(np.abs(x).max()) for x in (without, *data[::2]))
-    if method == "BCa" and np.ptp(without) <= 1e-12 * scale:  # every resample says the same
+    if method == "BCa" and np.ptp(without) <= 1e-12 * scale:  # all resamples are equal
         return value, value
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
-        for name in (method, "percentile"):  # where BCa has no answer
+        for name in (method, "percentile"):  # where BCa is not defined
             interval = scipy.stats.bootstrap(
                 data, statistic, paired=True, vectorized=True, batch=2000, method=name,
                 rng=np.random.default_rng(seed), **options,
@@ -230,8 +232,8 @@ PAIRED = (
 def paired(rows: pd.DataFrame, comparisons: Sequence[Comparison], scores: Sequence[str]) -> list[Record]:
     """Return one record per comparison, output and score: a `Difference`, None where there is nothing to compare.
 
-    Each output is compared with the baseline's of the same name; hindsight, where the baseline has none, with what that
-    said at once. `runs` counts the seeds of both, `pairs` those that both came to the end of. `p_holm` is
+    Each output is compared with the baseline's output of the same name; a smoothed one, where the baseline has none,
+    with the baseline's online output. `runs` counts the seeds of both, `pairs` those that both finished. `p_holm` is
     `p_wilcoxon` corrected for all tests of the list.
     """
     every = records(rows)

@@ -1,7 +1,7 @@
-"""How long steps take, all of them: a histogram that a row of the store can hold and that adds up over runs.
+"""The distribution of step times: a histogram small enough for a row of the store, which adds up over runs.
 
-Its bins are fixed beforehand, so that the histograms of many seeds are summed bin by bin, and at the bins' edges the
-share of steps that took longer is exact.
+Its bins are fixed, so that the histograms of many seeds are added bin by bin, and at the edges of bins the share of
+steps that took longer is exact.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from ...datasets.state import Array, TimeArray
 PER_DECADE = 40
 """Bins per factor of ten: one is 5.9 % wide."""
 DECADES = 13
-EDGES_NS: Array = 10.0 ** (np.arange(PER_DECADE * DECADES + 1) / PER_DECADE)
 """From a nanosecond to nearly three hours."""
+EDGES_NS: Array = 10.0 ** (np.arange(PER_DECADE * DECADES + 1) / PER_DECADE)
+"""Edges of the bins, from 1 ns, equally spaced in logarithm."""
 
 
 def step_histogram(step_ns: TimeArray) -> str:
     """Return how many of the times step_ns (n,) lie in each bin, as JSON: {bin: count}, without the empty bins.
 
-    Bin k holds EDGES_NS[k] ≤ t < EDGES_NS[k + 1]; what is beyond the last edge lies in the last bin, 0 in the first.
+    Bin k holds EDGES_NS[k] ≤ t < EDGES_NS[k + 1]; times beyond the last edge lie in the last bin, 0 in the first.
     """
     bins = np.searchsorted(EDGES_NS, step_ns, side="right") - 1
     found, counts = np.unique(bins.clip(0, len(EDGES_NS) - 2), return_counts=True)
@@ -54,7 +55,7 @@ class StepTimes:
         return int(self.counts.sum())
 
     def longer(self) -> tuple[Array, Array]:
-        """Return times, µs, (k,), and the share of steps that took at least so long, (k,): from all to the longest."""
+        """Return times, µs, (k,), and the share of steps that took at least that long, (k,), up to the longest step."""
         there = np.flatnonzero(self.counts)
         first, last = int(there[0]), int(there[-1])
         edges_us = EDGES_NS[first : last + 1] / 1e3
@@ -62,19 +63,19 @@ class StepTimes:
         return np.append(edges_us, max(self.max_us, edges_us[-1])), np.append(share, 1 / self.steps)
 
     def quantile_us(self, q: float) -> float:
-        """Return the upper edge of the bin that the quantile q lies in: that is at most 5.6 % less."""
+        """Return the quantile q of the step times, µs, as the upper edge of its bin: at most 5.9 % too high."""
         k = int(np.searchsorted(self.counts.cumsum(), q * self.steps))
         return min(float(EDGES_NS[k + 1]) / 1e3, self.max_us)
 
 
 def usual_machine(rows: Iterable[Mapping[str, Any]]) -> str | None:
-    """Return the machine, as the store has it, that most of the rows with step times were made on; None without any."""
+    """Return the machine, as the store has it, on which most rows with step times were run; None without any."""
     made = Counter(row["machine"] for row in rows if row.get("step_histogram"))
     return made.most_common(1)[0][0] if made else None
 
 
 def machine_name(machine: str | None) -> str:
-    """Return how a machine is called in a figure or a table: its processor and cores."""
+    """Return the name of a machine in figures and tables: its processor and cores."""
     known = json.loads(machine or "{}")
     cores = known.get("cores")
     return f"{' '.join(known.get('cpu', '').split()) or 'unknown processor'}{f', {cores} cores' if cores else ''}"

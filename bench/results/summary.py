@@ -1,4 +1,4 @@
-"""The rows of the store as people read them: one record per log, estimator and output, its seeds pooled."""
+"""Summaries of the store: one record per log, estimator and output, with its seeds pooled."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ Record: TypeAlias = dict[str, Any]
 
 SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
 SEEDS_ENOUGH = 5
-"""With fewer seeds an interval for ANEES is so wide that only NIS, where it was asked for, is worth a table."""
+"""With fewer seeds the interval of ANEES is so wide that only NIS, where it was asked for, is worth a table."""
 
 COUNTS = {
     "readings": ("readings",),
-    "late_used": ("late_used", "replayed"),  # by a smoother, by a filter that went back
+    "late_used": ("late_used", "replayed"),  # by a smoother, by a filter that rewinds
     "late_dropped": ("late",),
     "carried": ("carried",),
 }
 """What estimators did with readings that came late or between keyframes; summed over seeds."""
 
 UNFINISHED = ("diverged", "failed", "absent")
-"""How a run ends that is not done."""
+"""How a run ends that does not finish."""
 
 OUTLIERS = "outliers_"
-"""Counts of this prefix say how many readings an estimator took for outliers, or weighed down."""
+"""Prefix of the counts of readings that an estimator rejected, or gave less weight, as outliers."""
 
 
 def records(rows: pd.DataFrame) -> list[Record]:
@@ -48,7 +48,7 @@ def records(rows: pd.DataFrame) -> list[Record]:
 
 
 def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Record]]:
-    """Return the rows by these keys, in order of first appearance."""
+    """Return the rows grouped by these keys, in order of first appearance."""
     found: dict[tuple[Any, ...], list[Record]] = {}
     for row in rows:
         found.setdefault(tuple(row[key] for key in keys), []).append(row)
@@ -56,7 +56,7 @@ def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Rec
 
 
 def file_names(names: Iterable[str]) -> dict[str, str]:
-    """Return for each name one that a file, or a LaTeX label, may have; no two differ in capitals alone."""
+    """Return for each name one that files and LaTeX labels can have; no two differ only in capitals."""
     found: dict[str, str] = {}
     for name in dict.fromkeys(names):
         stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)
@@ -67,13 +67,12 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
 
 
 def summarise(rows: pd.DataFrame) -> list[Record]:
-    """Return one record per log, estimator and output, over the seeds that came to their end.
+    """Return one record per log, estimator and output, over the seeds that finished.
 
-    Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES, coverage are means; of
-    costs, the median is taken. `runs` and `done` say over how many, `diverged`, `failed` and `absent` what became of
-    the rest; where none is done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, by
-    degree of freedom, with the number of those times at which it lies above and below its interval. `start` says where
-    the priors came from, each way once.
+    Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES and coverage are means;
+    costs are medians. `done` of `runs` are pooled; `diverged`, `failed` and `absent` count the rest; where none is
+    done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, per degree of freedom, with
+    the number of those times at which it lies above and below its interval. `start` lists where the priors came from.
     """
     every = records(rows)
     ends = {
@@ -96,7 +95,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
         record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
         record |= _over_floor(done)
-        record |= _honesty(done)
+        record |= _consistency(done)
         counts = [json.loads(row["counts"] or "{}") for row in done]
         record |= {name: sum(run.get(of, 0) for run in counts for of in each) for name, each in counted.items()}
         summary.append(record)
@@ -104,7 +103,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
 
 
 def _rpe_step(group: Sequence[Record]) -> Record:
-    """Return which RPE a group's is, from its spec; None where that does not tell."""
+    """Return the step of a group's RPE, from its spec; None where that is not known."""
     scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
     return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
 
@@ -123,7 +122,7 @@ def _over_floor(done: Sequence[Record]) -> Record:
     """Return each RMSE over its floor, with its 95 % interval over seeds."""
     record: Record = {}
     for block, (score, floor) in OVER.items():
-        known = [row for row in done if row[score] is not None and row[floor]]  # over no floor there is no ratio
+        known = [row for row in done if row[score] is not None and row[floor]]  # without a floor there is no ratio
         squared_error, bound = (np.array([row[name] ** 2 for row in known]) for name in (score, floor))
         ratio = rmse_over_floor(squared_error, bound) if known else None
         for part, name in {"": "ratio", "_low": "low", "_high": "high"}.items():
@@ -131,7 +130,7 @@ def _over_floor(done: Sequence[Record]) -> Record:
     return record
 
 
-def _honesty(done: Sequence[Record]) -> Record:
+def _consistency(done: Sequence[Record]) -> Record:
     """Return NIS by sensor, and ANEES by block with its verdicts."""
     record: Record = dict.fromkeys(INNOVATIONS)
     record |= {f"nis_{sensor}": float(nis.value[0]) for sensor, nis in pooled_nis(done).items()}
@@ -168,12 +167,12 @@ def consistency(rows: pd.DataFrame) -> list[Record]:
 
 
 def is_judged(summary: Sequence[Record]) -> bool:
-    """Return whether there is enough of honesty to show: some NIS, or ANEES over enough seeds."""
+    """Return whether a table of consistency is worth showing: there is NIS, or ANEES over enough seeds."""
     enough = [row["done"] >= SEEDS_ENOUGH and row["anees_times"] is not None for row in summary]
     return any(enough) or any(row[name] is not None for row in summary for name in INNOVATIONS)
 
 
 def _outliers(rows: Iterable[Record]) -> list[str]:
-    """Return the names of all counts of outliers that any run has."""
+    """Return the names of the counts of outliers, over all runs."""
     names = {name for row in rows for name in json.loads(row["counts"] or "{}") if name.startswith(OUTLIERS)}
     return sorted(names)

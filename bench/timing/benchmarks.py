@@ -2,7 +2,7 @@
 
 `pytest tests/bench/timing` times these. `fathom timing against REV` compares them with those of another revision: it
 loads this file into the packages of both revisions, so both do the same work. The modules of a revision may lie
-elsewhere. So a benchmark uses the public names (DESIGN, section 10) wherever it can, and imports within its function: a
+elsewhere. So a benchmark uses the public names of README wherever it can, and imports within its function: a
 revision that lacks a name lacks that benchmark only. `write_inputs` writes logs and stores once; both read them.
 """
 
@@ -50,6 +50,7 @@ class Benchmark:
 
 
 SMALL = {"depth_m": 5.0, "leg_m": 15.0, "turn_radius_m": 5.0, "surface_for_s": 10.0}
+"""A mission small enough to dive and turn within 20 s."""
 SCENARIOS: Mapping[str, dict[str, Any]] = {
     "short": {**SMALL, "imu": "tactical", "duration_s": 20.0},
     "minute": {**SMALL, "imu": "tactical", "duration_s": 60.0},
@@ -63,6 +64,7 @@ SCENARIOS: Mapping[str, dict[str, Any]] = {
     },
 }
 POSES = 20_000
+"""Enough that the fixed cost of a call does not show."""
 ROWS = {
     "name": "rows",
     "description": "Rows for the tables.",

@@ -32,6 +32,7 @@ from .compiling import compile_cpu_seconds
 from .whole_runs import finished_again_mb, finished_again_s, whole_run
 
 LAGS_S = (3.0, 10.0, 30.0)
+"""The lags of the main experiment, and a long one."""
 CHEAPER = ({}, {"wildfire": 0.1}, {"wildfire": 0.1, "relinearize": [0.05, 1e3, 0.5, 10.0]})
 """Settings of `fls`, each cheaper than the one before, in time per keyframe."""
 

@@ -23,6 +23,7 @@ from .printing import machine_text, made
 
 EXPERIMENT = "cost"
 LAGS_S = (3.0, 10.0, 30.0)
+"""The lags of the main experiment, and a long one."""
 COLUMNS = (
     "estimator",
     "µs per IMU sample",

@@ -30,6 +30,7 @@ ABOUT = (
     "written down · rest: readings sorted, Python, all else"
 )
 REPEATS = 5
+"""Of each log; the quickest of each step is kept, so that interruptions do not count."""
 EVERY = "all"
 SHORT_S, LONG_S = 90.0, 1200.0
 """Length of the log for the split and the lags, three times the longest lag; and of that for the course over a log."""

@@ -18,11 +18,13 @@ from ..output.figures.drawing import WIDTH_IN, Look, empty_figure, handle, logar
 from .passes import Stopwatch, quickest, stopwatch
 
 LAGS_S = (1.0, 3.0, 10.0, 30.0)
+"""Each about three times the one before."""
 PIECES = 24
 """Pieces of equal length that a log is cut into: of 20 minutes, 50 s each, with 250 keyframes."""
 BOOTSTRAPS = 2000
 """Resamples: the ends of a 95 % interval are then the 50th from either side."""
 TEN_MINUTES_S = 600.0
+"""s."""
 
 Tell = Callable[[str], None]
 

@@ -22,9 +22,11 @@ from ..results.store import Store
 from .budgets import Measured
 
 FINISHED = 20_000
+"""Runs of a large experiment, of which nothing is left to do."""
 WORK_S = 0.4
 """Processor time of simulating and running in each round: enough for the clock, and for what happens now and then."""
 ROUNDS = 5
+"""Of which the sums are compared."""
 
 
 def _experiment(duration_s: float, seeds: int, estimator: str = "eskf") -> dict[str, Any]:

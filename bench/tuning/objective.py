@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from ...datasets.errors import nearest
 from ...datasets.state import Array
 from ..errors import ExperimentError
-from ..experiment.comparison import OVER_SEEDS
+from ..metrics.comparison import OVER_SEEDS
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
 from ..results.paired import FEWEST_SEEDS, TAKE, bootstrap_interval
@@ -32,6 +32,7 @@ SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(
 
 
 BOOTSTRAP = {"confidence_level": 0.95, "n_resamples": 9999}
+"""Of every interval: scipy's own number of resamples."""
 
 
 class Marks(NamedTuple):

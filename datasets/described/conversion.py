@@ -1,9 +1,9 @@
-"""From a description and a folder to a Log: rows are read, checked, converted to our frames and units, and counted.
+"""From a description and a folder to a Log: rows are read, checked, and converted to our frames and units.
 
-Every stream goes the same way: rows declared invalid are dropped; rows with numbers that are not finite are an error,
-or dropped under `repair`; outliers as declared are dropped; times out of order are an error, or dropped under
-`repair`; every n-th row is kept. Whatever was dropped is told in `Log.notes`. A truth or a stream that shares no time
-with the IMU is an error: some clock is wrong.
+The steps are the same for every stream. Rows declared invalid are dropped. Rows with numbers that are not finite are an
+error, or dropped with `repair`. Declared outliers are dropped. Times out of order are an error, or dropped with
+`repair`. Every n-th row is kept. `Log.notes` counts all that was dropped. A truth or a stream that does not overlap
+the IMU's time is an error: some clock is wrong.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ Mask = NDArray[Any]
 FLIP_YZ = np.array([1.0, -1.0, -1.0])
 """FRD to FLU, and back."""
 FAR_M = 100e3
-"""No vehicle of ours is farther than this from an earth that were a ball; a receiver without a fix says (0, 0, 0)."""
+"""From a spherical Earth of the semi-major axis: the ellipsoid is within 21 km of it, and a receiver without a fix
+reports (0, 0, 0)."""
 DEVICE = "device"
-"""The column that a message's own clock adds."""
+"""The column added by a message's own clock."""
 
 
 @dataclass
 class _Opening:
-    """One opening of one folder: where, how strict, and what has been said so far."""
+    """The state of opening one folder: description, strictness, notes and messages so far."""
 
     description: d.Description
     folder: Path
@@ -51,7 +52,7 @@ class _Opening:
     messages: dict[tuple[str, int | None], Mapping[str, NDArray[Any]]] | None = None
 
     def columns(self, part: d.SourceDescription | d.TruthDescription, wanted: Iterable[d.Column]) -> Columns:
-        """Read the raw columns a part asks for, from its table or its messages; times stay as they are written."""
+        """Read the raw columns of a part from its table or its messages; times are not converted."""
         times = [] if part.time is None else [c for c in (part.time.column, part.time.received) if c is not None]
         if part.table is not None:
             return read_table(self.folder, part.table, [c for c in wanted if c not in times], times)
@@ -59,7 +60,7 @@ class _Opening:
         return self._joined(part.message, list(wanted))
 
     def _joined(self, message: d.Message, wanted: list[d.Column]) -> Columns:
-        """Return columns of messages; `device` is their own clock on the host's."""
+        """Return columns of messages; `device` is their own clock, mapped to the host's."""
         if self.messages is None:
             self._read_messages()
         assert self.messages is not None
@@ -86,7 +87,7 @@ class _Opening:
         return columns
 
     def _read_messages(self) -> None:
-        """Read all that the description asks of its recording, in one pass."""
+        """Read everything that the description needs from its recording, in one pass."""
         recording = self.description.recording
         assert recording is not None
         asked: dict[tuple[str, int | None], dict[str, None]] = {}
@@ -107,7 +108,7 @@ class _Opening:
 
 
 def _field(message: d.Message, column: str, recording: Recording, folder: Path) -> tuple[int, str]:
-    """Return which of the joined messages a column is of, and its field there; the host's stamp is the first one's."""
+    """Return the index of the joined message that has a column, and its field; the host's stamp is the first one's."""
     if len(message.names) == 1 or column == recording.host_clock[0]:
         return 0, column
     for which, name in enumerate(message.names):
@@ -117,7 +118,7 @@ def _field(message: d.Message, column: str, recording: Recording, folder: Path) 
 
 
 def _sources(description: d.Description) -> Iterator[tuple[Any, list[d.Column]]]:
-    """Yield every source of columns of a description, with the columns that are asked of it."""
+    """Yield every source of columns of a description, with the columns to read from it."""
     for part in description.parts.values():
         if isinstance(part, d.ImuDescription) and part.accel_source is not None:
             yield part.accel_source, [*d.columns_of(part.accel_source), *part.accel.columns]
@@ -128,10 +129,10 @@ def _sources(description: d.Description) -> Iterator[tuple[Any, list[d.Column]]]
 
 @dataclass
 class _Rows:
-    """Rows of one stream that are left, with their number in the source.
+    """The remaining rows of one stream, with their number in the source.
 
     Attributes:
-        raw: (n,) per column, as read.
+        raw: (n,) per column, not converted.
         number: (n,) row in the source, from 0.
         t_ns, received_ns: (n,).
     """
@@ -152,7 +153,7 @@ class _Rows:
             self.opening.notes.append(f"{self.stream}: {count} rows {what} dropped")
 
     def refuse(self, bad: Mask, complaint: Any, what: str) -> None:
-        """Drop the rows of `bad` under repair; without, raise complaint(first bad row)."""
+        """With repair, drop the rows of `bad`; without, raise complaint(first bad row)."""
         if not bad.any():
             return
         first, count = int(np.flatnonzero(bad)[0]), int(np.count_nonzero(bad))
@@ -178,7 +179,7 @@ class _Rows:
 
 @contextmanager
 def _named(folder: Path) -> Iterator[None]:
-    """Put the folder in front of the errors of types that do not know it."""
+    """Prefix errors with the folder, for types that do not know it."""
     try:
         yield
     except DatasetError as error:
@@ -186,10 +187,10 @@ def _named(folder: Path) -> Iterator[None]:
 
 
 def build_log(description: d.Description, folder: Path, *, repair: bool = False) -> Log:
-    """Read the recording a description tells of.
+    """Read the recording of a description.
 
     Raises:
-        DatasetError: what is wrong, with file or stream, row and value.
+        DatasetError: names the problem with file or stream, row and value.
     """
     opening = _Opening(description, folder, repair)
     streams = description.streams
@@ -251,13 +252,13 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
 
 
 def _check_clocks(log: Log) -> None:
-    """Refuse a prior outside the IMU's time, and a truth or a stream that shares no time with it."""
+    """Refuse a prior outside the IMU's time, and a truth or a stream that does not overlap it."""
     start_ns, end_ns = int(log.imu.t_ns[0]) - 2 * log.imu.period_ns, int(log.imu.t_ns[-1])
     imu = f"the IMU's time, {log.imu.t_ns[0] * 1e-9:.3f} s to {end_ns * 1e-9:.3f} s"
     if log.prior is not None and not start_ns <= log.prior.t_ns < end_ns:
         raise DatasetError(f"prior: t_ns, {log.prior.t_ns * 1e-9:.3f} s, lies outside {imu}")
     if log.truth is not None and not len(log.truth):
-        raise DatasetError("truth: no rows; leave `truth` out where nobody knows")
+        raise DatasetError("truth: no rows; leave `truth` out if it is unknown")
     for name, part in {**log.streams, "truth": log.truth}.items():
         if part is not None and len(part) and (part.t_ns[-1] < start_ns or part.t_ns[0] > end_ns):
             raise DatasetError(
@@ -267,7 +268,7 @@ def _check_clocks(log: Log) -> None:
 
 
 def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) -> _Rows:
-    """Read a stream's rows and drop, or refuse, those without a time or without numbers."""
+    """Read a stream's rows, and drop or refuse those without a valid time or finite numbers."""
     time: d.Time = part.time
     sigma = getattr(part, "sigma", None)
     sigma_columns = [] if sigma is None else list(sigma.columns)
@@ -376,7 +377,7 @@ def _in_order(rows: _Rows, every: int) -> NDArray[np.int64]:
 
 
 def _without_outliers(rows: _Rows, outliers: d.Outliers | None, values: Array, unit: str) -> Array:
-    """Drop rows whose norm exceeds the bound; return the values that are left."""
+    """Drop rows whose norm exceeds the bound; return the remaining values."""
     if outliers is None:
         return values
     chosen = list(range(values.shape[1])) if outliers.components is None else list(outliers.components)
@@ -426,9 +427,9 @@ def _imu(opening: _Opening, part: d.ImuDescription) -> ImuStream:
 def _gyro_and_accel(
     opening: _Opening, part: d.ImuDescription, source: d.SourceDescription
 ) -> tuple[TimeArray, Array, Array]:
-    """Return the gyro's times and samples, and the accelerometer's put there linearly.
+    """Return the gyro's times and samples, and the accelerometer's interpolated linearly to them.
 
-    A gyro's sample that has no accelerometer's on both sides within two of its periods is dropped, and counted.
+    A gyro sample without accelerometer samples on both sides, within two of their periods, is dropped and counted.
     """
     rows = _stream(opening, "imu", part, list(part.gyro.columns))
     _in_order(rows, 1)
@@ -464,9 +465,9 @@ def _dvl(opening: _Opening, part: d.DvlDescription) -> DvlStream:
 
 
 def _turned(sigma: Array, R_BS: Array) -> Array:
-    """Return (n, 3): sigma along B's axes; the correlations of unequal axes are let go.
+    """Return (n, 3): sigma along B's axes, without the correlations that unequal axes get.
 
-    An infinite sigma spreads to the axes of B that the mounting gives a share in it, and to no others.
+    An infinite sigma makes those axes of B infinite that have a component along it, and no others.
     """
     with np.errstate(invalid="ignore"):
         shares = sigma[:, None, :] ** 2 * R_BS**2
@@ -565,7 +566,7 @@ def degrees_from_ddmm(ddmm: Array) -> Array:
 
 
 def _latitude_longitude(rows: _Rows, part: d.Geodetic) -> tuple[Array, Array]:
-    """Return radians; refuse what lies on no globe."""
+    """Return radians; refuse impossible latitudes and longitudes."""
 
     def convert() -> tuple[Array, Array]:
         lat, lon = rows.raw[part.latitude].astype(float), rows.raw[part.longitude].astype(float)
@@ -584,7 +585,7 @@ def _latitude_longitude(rows: _Rows, part: d.Geodetic) -> tuple[Array, Array]:
 
 
 def _on_the_globe(rows: _Rows, part: Any) -> tuple[Array, Array, Array | None]:
-    """Return latitude, longitude (rad) and height (m, where there is one) of rows that tell a place on the globe."""
+    """Return latitude, longitude (rad) and height (m, or None) of rows with a global position."""
     if part.geodetic is None:
         p_ecef = rows.si(part.position)
         far = ~(np.abs(np.linalg.norm(p_ecef, axis=1) - SEMI_MAJOR_M) < FAR_M)
@@ -599,12 +600,12 @@ def _on_the_globe(rows: _Rows, part: Any) -> tuple[Array, Array, Array | None]:
 
 
 def _offset(rows: _Rows, part: Any) -> Array | None:
-    """Return (n, 3) m, the local offset from the place on the globe, where there is one."""
+    """Return (n, 3) m, the local offset from the global position; None if there is none."""
     return None if part.geodetic is None or part.position is None else _enu(rows.si(part.position), part.frame)
 
 
 def _first_fix(part: Any, rows: _Rows, start_ns: int) -> tuple[float, float] | None:
-    """Return the place (rad) of the first row at or after the IMU's start, local offset included."""
+    """Return latitude and longitude (rad) of the first row at or after the IMU's start, local offset included."""
     lat, lon, _ = _on_the_globe(rows, part)
     after = np.flatnonzero(rows.t_ns >= start_ns)
     if not len(after):
@@ -619,7 +620,7 @@ def _first_fix(part: Any, rows: _Rows, start_ns: int) -> tuple[float, float] | N
 
 
 def _position(rows: _Rows, part: Any, origin: tuple[float, float] | None) -> Array:
-    """Return (n, 3) m in W. Heights are over the surface, not over the tangent plane: the depth sensor's are, too."""
+    """Return (n, 3) m in W. Heights are above the sea surface, as those of the depth sensor, not the tangent plane."""
     if not part.on_the_globe:
         return _enu(rows.si(part.position), part.frame)
     lat, lon, height = _on_the_globe(rows, part)

@@ -1,7 +1,7 @@
-"""What `log.yaml` may say: the models of a log's description, one per part, and the check that names what is wrong.
+"""The models of `log.yaml`, one per part, and the check that reports what is wrong in one.
 
-A description tells where each stream's numbers lie and what they mean; `conversion` turns the numbers into a Log.
-Lengths of lists are checked here, so nothing is read before the whole description is known to be sound.
+A description states where the numbers of each stream are and what they mean; `conversion` turns them into a Log. All
+checks that need no data are made here, so no data is read before the whole description is valid.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from ..state import LIMIT_NS, Array, Belief, NavState
 
 Sigma = Annotated[float, Field(gt=0)]
 Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
-"""Seconds to add to a time, s: 73 years at most, so that no sum of them overflows."""
+"""A shift of a time, s: at most 73 years, so that no sum overflows."""
 Checked = TypeVar("Checked", bound=BaseModel)
 
 
 class DeviceClock(Part):
-    """A clock inside the sensor, exact but free-running, put onto the host's.
+    """A clock inside the sensor, exact but free-running, mapped to the host's.
 
-    A straight line (offset and drift) is laid along the smallest reception delays of the host's stamps.
+    A straight line (offset and drift) is fitted to the smallest reception delays of the host's stamps.
     """
 
     field: str
@@ -40,15 +40,15 @@ class DeviceClock(Part):
 
 
 class Message(Part):
-    """Messages of the recording; each field is a column, and so is what the format adds (its `host_clock`, for one)."""
+    """Messages of the recording; each field is a column, and so is what the format adds (such as its `host_clock`)."""
 
     names: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Joined where their device clocks agree when there are several; columns are then `Name.field`."""
+    """Several are joined by equal device times; columns are then `Name.field`."""
     entity: int | None = None
-    """Which of several senders of that name: `src_ent` in IMC, any when left out; the instance in ArduPilot, where
-    it may be left out only if there is one."""
+    """Which of several senders of that name. In IMC `src_ent`, any if left out; in ArduPilot the instance, which may
+    be left out only if there is one."""
     clock: DeviceClock | None = None
-    """Adds the column `device`: this clock, unwrapped and put onto the host's, s."""
+    """Adds the column `device`: this clock, unwrapped and mapped to the host's, s."""
 
     @model_validator(mode="after")
     def _joined_by_a_clock(self) -> Self:
@@ -139,7 +139,7 @@ class Angles(Angle):
 class Geodetic(Part):
     """Latitude and longitude (north and east positive), and the height where there is one.
 
-    W is tangent at the origin; heights stay what they are above the surface, as the depth sensor has them.
+    W is tangent at the origin; heights stay above the sea surface, as those of the depth sensor.
     """
 
     latitude: Column
@@ -192,14 +192,14 @@ class Time(Part):
 
 
 class Valid(Part):
-    """Rows count only where this column holds one of these values."""
+    """Rows are used only if this column holds one of these values."""
 
     column: Column
     values: Annotated[tuple[Finite, ...], Field(min_length=1)]
 
 
 class Outliers(Part):
-    """The whole row is dropped where the norm of these components, in SI, exceeds `above`."""
+    """The whole row is dropped if the norm of these components, in SI, exceeds `above`."""
 
     above: Positive
     components: tuple[Annotated[int, Field(ge=0, le=2)], ...] | None = None
@@ -222,7 +222,7 @@ class NoiseDescription(Part):
 
 
 class SourceDescription(Part):
-    """A source of columns, a time, and rows to pass over."""
+    """A source of columns, a time, and which rows are valid."""
 
     table: Table | None = None
     message: Message | None = None
@@ -237,26 +237,26 @@ class SourceDescription(Part):
 
 
 class StreamDescription(SourceDescription):
-    """What all streams have."""
+    """The keys that all streams have."""
 
     every: Annotated[int, Field(ge=1)] = 1
-    """Keep every n-th of the rows that are left."""
+    """Keep every n-th of the remaining rows."""
 
 
 class ImuDescription(StreamDescription):
-    """Gyro and accelerometer; each sample is taken for the mean over the interval that ends at its time."""
+    """Gyro and accelerometer; each sample is taken as the mean over the interval that ends at its time."""
 
     gyro: Rate
     accel: Acceleration
     accel_source: SourceDescription | None = None
-    """Where the accelerometer's rows are, when they are not the gyro's: interpolated linearly to the gyro's times."""
+    """Source of the accelerometer's rows, if not the gyro's; they are interpolated linearly to the gyro's times."""
     axes: Literal["FLU", "FRD"] = "FLU"
     mounting: MountingSpec = MountingSpec()
     noise: NoiseDescription
 
 
 class AidingDescription(StreamDescription):
-    """An aiding sensor: its sigma is fixed (the field that names the unit), or `sigma`, columns row by row."""
+    """An aiding sensor. Its sigma is fixed (the key with the unit), or `sigma` names columns with one per row."""
 
     sigma_field: ClassVar[str]
     outliers: Outliers | None = None
@@ -274,26 +274,25 @@ class DvlDescription(AidingDescription):
     sigma_field = "sigma_m_s"
     velocity: Speeds
     measures: Annotated[tuple[Literal["x", "y", "z"], ...], Field(min_length=1)] = ("x", "y", "z")
-    """The axes that the columns of `velocity` (and of `sigma`) are; an axis left out is unmeasured: its sigma is
-    infinite."""
+    """The axes of the columns of `velocity` (and of `sigma`). An axis left out is unmeasured: its sigma is infinite."""
     axes: Literal["FLU", "FRD"] = "FLU"
     mounting: MountingSpec = MountingSpec()
-    """Turns what is measured into B's axes; its translation must be zero, since B sits in the DVL."""
+    """Rotates the velocity into B's axes; its translation must be zero, since the DVL is B's origin."""
     sigma_m_s: Sigma | tuple[Sigma, ...] | None = None
     sigma: Speeds | None = None
 
     @model_validator(mode="after")
     def _axes_fit(self) -> Self:
         if len(set(self.measures)) != len(self.measures):
-            raise ValueError("measures: an axis stands there twice")
+            raise ValueError("measures: an axis is named twice")
         if len(self.velocity.columns) != len(self.measures):
             raise ValueError(f"velocity: expected {len(self.measures)} columns, found {len(self.velocity.columns)}")
         if isinstance(self.sigma_m_s, tuple) and len(self.sigma_m_s) != len(self.measures):
             raise ValueError(f"sigma_m_s: expected {len(self.measures)} numbers, found {len(self.sigma_m_s)}")
         if any(self.mounting.translation_m):
-            raise ValueError("mounting: B sits in the DVL; give the other sensors' translations from there")
+            raise ValueError("mounting: the DVL is the origin of B; give the other sensors' translations from there")
         if self.mounting != MountingSpec() and len(self.measures) < 3:
-            raise ValueError("mounting: only a velocity measured along all three axes can be turned")
+            raise ValueError("mounting: only a velocity measured along all three axes can be rotated")
         return self
 
 
@@ -309,7 +308,7 @@ class DepthDescription(AidingDescription):
 
 
 class Placed(Part):
-    """A place: geodetic, or in local axes, or both (a local offset from a geodetic point); or earth-centred (ECEF)."""
+    """A position: geodetic, or in local axes, or both (a local offset from a geodetic point), or earth-centred."""
 
     geodetic: Geodetic | None = None
     position: Lengths | None = None
@@ -318,13 +317,13 @@ class Placed(Part):
 
     @property
     def on_the_globe(self) -> bool:
-        """Whether the place is one on the globe; else it is in W."""
+        """Whether the position is global; else it is in W."""
         return self.geodetic is not None or (self.position is not None and self.frame == "ECEF")
 
     @model_validator(mode="after")
     def _one_place(self) -> Self:
         if self.geodetic is not None and self.position is not None and self.frame == "ECEF":
-            raise ValueError("ECEF positions are places by themselves: leave `geodetic` out")
+            raise ValueError("ECEF positions are global already: leave `geodetic` out")
         return self
 
 
@@ -333,7 +332,7 @@ class GpsDescription(AidingDescription, Placed):
 
     sigma_field = "sigma_m"
     sigma_m: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
-    """East, north, up; .inf for a component that was not measured. Without a height the third is taken as .inf."""
+    """East, north, up; .inf for a component that was not measured. Without a height the third is .inf."""
     sigma: Lengths | None = None
     mounting: MountingSpec = MountingSpec()
 
@@ -352,7 +351,7 @@ class HeadingDescription(AidingDescription):
     convention: Literal["compass", "yaw"] = "compass"
     """compass: clockwise from north; yaw: counter-clockwise from east."""
     add_deg: Finite = 0.0
-    """Added to the angle as read, in its own convention: declination, deviation, offset."""
+    """Added to the angle in its own convention: declination, deviation, offset."""
     attitude: Attitude | None = None
     sigma_deg: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
     sigma: Angle | Angles | None = None
@@ -370,7 +369,7 @@ class HeadingDescription(AidingDescription):
 
 
 def columns_of(part: BaseModel) -> list[Column]:
-    """Return every column that a part of a description names, in the order of its keys."""
+    """Return every column that a part of a description names, in the order of the keys."""
     found: list[Column] = []
     for name in type(part).model_fields:
         value = getattr(part, name)
@@ -386,7 +385,7 @@ def columns_of(part: BaseModel) -> list[Column]:
 
 
 class Streams(Part):
-    """The sensors; only the IMU must be there."""
+    """The sensors; only the IMU is required."""
 
     imu: ImuDescription
     dvl: DvlDescription | None = None
@@ -396,10 +395,10 @@ class Streams(Part):
 
 
 class TruthDescription(Placed):
-    """Where the vehicle was: one of a TUM file, a table of ours (`trajectory`), or a stream like the others."""
+    """The true trajectory: a TUM file, a table of ours (`trajectory`), or a stream like the others."""
 
     kind: Literal["truth", "reference"] = "truth"
-    """reference: another filter's output."""
+    """reference: the output of another filter."""
     tum: str | None = None
     trajectory: str | None = None
     """.parquet or .csv with the columns of `Trajectory.to_pandas`."""
@@ -410,10 +409,10 @@ class TruthDescription(Placed):
     valid: Valid | None = None
     every: Annotated[int, Field(ge=1)] = 1
     height_m: Finite | None = None
-    """Height over the surface, taken as constant, where the source has no height of the vehicle."""
+    """Constant height above the sea surface, if the source has no height."""
     velocity: Velocity | None = None
     attitude: Attitude | None = None
-    """Without it the truth's R_WB are NaN: unknown."""
+    """Without it the truth's R_WB are NaN (unknown)."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -429,14 +428,14 @@ class TruthDescription(Placed):
 
 
 class Origin(Part):
-    """W's origin, given."""
+    """The origin of W."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)]
     longitude_deg: Annotated[float, Field(ge=-360, le=360)]
 
 
 def _is_covariance(P: Array) -> bool:
-    """Whether P is symmetric and positive semi-definite; judged by its correlations, so units do not matter."""
+    """Whether P is symmetric and positive semi-definite, tested on its correlations, so that units do not matter."""
     sigma = np.sqrt(np.maximum(P.diagonal(), 0.0))
     sigma[sigma == 0] = 1.0
     with np.errstate(over="ignore"):
@@ -456,7 +455,7 @@ class PriorDescription(Part):
     b_a: Vector
     b_g: Vector
     P: tuple[tuple[Finite, ...], ...]
-    """Symmetric and positive semi-definite: a zero says that this error is known to be none."""
+    """Symmetric and positive semi-definite; a zero variance states that there is no error."""
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
@@ -480,26 +479,26 @@ class Description(Part):
     """A log's description, `log.yaml`."""
 
     name: str | None = None
-    """What tables call the log; the folder's name when left out."""
+    """Name of the log in tables; the folder's name if left out."""
     title: str = ""
     source: str = ""
-    """Where the recording comes from, its licence, whom to cite."""
+    """Origin of the recording, its licence, and whom to cite."""
     notes: tuple[str, ...] = ()
-    """Every quirk of the source in a sentence; what was fitted to the truth says so."""
+    """Peculiarities of the source, one sentence each; a value that was fitted to the truth is marked as such."""
     gravity: Finite = 9.81
     """m/s²."""
     origin: Origin | None = None
-    """W's origin. When left out and the log is geodetic, it is the first fix (of gps, else of truth) at or after the
-    IMU's start, so that the vehicle starts at zero."""
+    """The origin of W. If left out in a geodetic log, it is the first fix (of gps, else of truth) at or after the IMU's
+    start, so that the vehicle starts at zero."""
     recording: SerializeAsAny[Recording] | None = None
-    """The one file that the streams' messages are in, by its `format`; the format's loader says what else it takes."""
+    """The file with the streams' messages. Its `format` chooses the loader, which defines the other keys."""
     streams: Streams
     truth: TruthDescription | None = None
     prior: PriorDescription | None = None
 
     @property
     def parts(self) -> dict[str, StreamDescription | TruthDescription]:
-        """The streams that are there and, where it is one, the truth; by name."""
+        """The streams and the truth that are described, by name."""
         named = {name: getattr(self.streams, name) for name in Streams.model_fields} | {"truth": self.truth}
         return {name: part for name, part in named.items() if part is not None}
 
@@ -529,7 +528,7 @@ def read_description(path: Path) -> Description:
 
 
 def check_description(raw: dict[Any, Any], where: str) -> Description:
-    """Check a parsed description; `where` stands at the head of the error."""
+    """Check a parsed description; errors begin with `where`."""
     recording = raw.get("recording")
     if isinstance(recording, dict):
         raw = {**raw, "recording": _checked(_loader(recording, where), recording, where, ("recording",))}
@@ -537,7 +536,7 @@ def check_description(raw: dict[Any, Any], where: str) -> Description:
 
 
 def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple[str, ...] = ()) -> Checked:
-    """Return the part that `raw` describes, which stands at `above` in the description."""
+    """Return the validated part, whose path in the description is `above`."""
     try:
         return model.model_validate(raw)
     except ValidationError as error:

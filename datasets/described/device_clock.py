@@ -1,4 +1,4 @@
-"""A free-running clock inside a sensor: unwrapped, and laid onto the host's."""
+"""A free-running clock inside a sensor: unwrapped, and mapped to the host's clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..state import Array
 def common_instants(
     host_s: Sequence[Array], device_s: Sequence[Array], wraps_at_s: float
 ) -> tuple[list[NDArray[np.int64]], Array]:
-    """Join messages that carry one device clock, where their clocks agree to the microsecond.
+    """Join messages that carry the same device clock, where their times agree to the microsecond.
 
     Args:
         host_s, device_s: (n_k,) stamps of each kind of message.
@@ -35,7 +35,7 @@ def common_instants(
 
 
 def unwrap(host_s: Array, device_s: Array, wraps_at_s: float) -> Array:
-    """Return the device clock without its jumps, counted by the host's clock; they may disagree by half a lap."""
+    """Return the device clock without its jumps, counted by the host's clock; the two may differ by half a period."""
     if not len(host_s):
         return device_s
     with np.errstate(invalid="ignore", over="ignore"):
@@ -47,8 +47,8 @@ def unwrap(host_s: Array, device_s: Array, wraps_at_s: float) -> Array:
 def onto_host(host_s: Array, device_s: Array, window_s: float = 10.0) -> Array:
     """Return the device's times on the host's clock: offset and drift from the smallest delays of each window.
 
-    The device clock is exact but runs at its own rate (1.1e-3 fast has been met); a reception is late by something that
-    is sometimes nearly nothing. So a line is fitted to the smallest host − device of each window.
+    The device clock is exact but has its own rate (1.1e-3 fast has been seen). A reception is late by an amount that is
+    sometimes nearly zero. So a line is fitted to the smallest host − device of each window.
     """
     good = np.isfinite(device_s) & np.isfinite(host_s) & (np.abs(host_s) < 1e12)
     if not good.any():

@@ -1,4 +1,4 @@
-"""Write a log as a described folder: log.yaml and one file per stream, which opens again bit for bit."""
+"""Write a log as a described folder: log.yaml and one file per stream; it reads back bit for bit."""
 
 from __future__ import annotations
 

@@ -6,9 +6,10 @@ import numpy as np
 
 from ..state import Array
 
+# WGS 84, defining parameters (NGA.STND.0036, table 3.1).
 SEMI_MAJOR_M = 6378137.0
-FLATTENING = 1 / 298.257223563
-ECCENTRICITY_SQUARED = FLATTENING * (2 - FLATTENING)
+FLATTENING = 1 / 298.257223563  # (the standard states the inverse)
+ECCENTRICITY_SQUARED = FLATTENING * (2 - FLATTENING)  # of the ellipse, from its definition
 
 
 def ecef_from_geodetic(latitude: Array, longitude: Array, height_m: Array) -> Array:
@@ -33,7 +34,7 @@ def geodetic_from_ecef(p_ecef: Array) -> tuple[Array, Array, Array]:
 
 
 def enu_axes(latitude: Array, longitude: Array) -> Array:
-    """Return (n, 3, 3): rows are east, north and up at each place, in ECEF axes."""
+    """Return (n, 3, 3): rows are east, north and up at each position, in ECEF axes."""
     s, c, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     zero = np.zeros_like(s)
     rows = [[-sl, cl, zero], [-s * cl, -s * sl, c], [c * cl, c * sl, s]]

@@ -11,10 +11,12 @@ from .conversion import build_log
 from .description import read_description
 
 CATALOG = Path(__file__).parents[1] / "catalog"
+"""Where the descriptions lie that come with this package."""
+"""Where the descriptions lie that come with this package."""
 
 
-class RecordingNotFound(DatasetError):  # noqa: N818  (a plain statement of what is not there)
-    """The description is known, but the recording it tells of is not where it was looked for."""
+class RecordingNotFound(DatasetError):  # noqa: N818  (named as FileNotFoundError's kin, without the suffix)
+    """The description is in the catalog, but its recording was not found."""
 
 
 def catalog_names() -> list[str]:
@@ -27,13 +29,13 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
 
     Args:
         name_or_folder: a catalog entry's name, or its recording's folder; or a folder with a log.yaml; or a description
-            file (.yaml), whose files lie in `data`, or beside it.
+            file (.yaml), whose files lie in `data`, or next to it.
         data: folder whose subfolders are the recordings; FATHOM_DATA when left out.
-        repair: drop rows that are not finite or not in order, and count them in the log's notes, instead of refusing.
+        repair: drop rows that are not finite or out of order, and count them in the log's notes, instead of an error.
 
     Raises:
-        RecordingNotFound: the catalog entry is known, its recording is not there.
-        DatasetError: anything else that is wrong, naming what, where, and the nearest known name.
+        RecordingNotFound: the catalog entry is known, its recording is missing.
+        DatasetError: anything else, naming what, where, and the nearest known name.
     """
     path = Path(name_or_folder)
     try:
@@ -63,7 +65,7 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
 def _open_catalogued(name: str, data: str | Path | None, *, repair: bool) -> Log:
     root = data if data is not None else os.environ.get("FATHOM_DATA") or None
     if root is None:
-        raise RecordingNotFound(f"{name}: nobody said where recordings are; use --data DIR or set FATHOM_DATA")
+        raise RecordingNotFound(f"{name}: the folder of recordings is not set; use --data DIR or set FATHOM_DATA")
     folder = Path(root) / name
     if not folder.is_dir():
         whence = "--data" if data is not None else "FATHOM_DATA"

@@ -1,1 +1,6 @@
-"""Readers of recordings: one file per format; each yields columns of numbers as they stand in the file."""
+"""One loader per file format, from bytes to columns of numbers; what the numbers mean is stated in log.yaml.
+
+`recording` is the interface of a loader and the registry. `imc` and `ardupilot` read files of messages. `topics` is
+what ROS bags (`ros_bag`, `ros_messages`) and MCAP files (`mcap_file`) have in common. `columns` reads tables: text,
+Parquet or NumPy arrays.
+"""

@@ -1,9 +1,9 @@
-"""ArduPilot dataflash logs (.BIN): messages of fixed size whose layouts stand in the log itself, as FMT messages.
+"""ArduPilot dataflash logs (.BIN): messages of fixed size, whose layouts are in the log itself as FMT messages.
 
-The file is read in chunks and only the messages asked for are kept. There are no checksums: a message counts where
-another begins right after it, or the file ends; anything else is passed over, and reading goes on at the next header.
-The alphabet of layouts is pymavlink's. Its own reader is not used: it keeps 40 bytes of index for every message of the
-file, decodes one at a time, and loses the whole log to one damaged FMT (tried, 2.4.50).
+The file is read in chunks and only the wanted messages are kept. There are no checksums: a message is accepted if
+another header or the end of the file follows it; anything else is skipped up to the next header. The letters of layouts
+are pymavlink's. Its own reader is not used: it keeps 40 bytes of index for every message of the file, decodes one at a
+time, and loses the whole log to one damaged FMT (tested with 2.4.50).
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from .recording import Held, Messages, Recording, Wanted, extra, not_held
+from .recording import Messages, Recording, TopicInfo, Wanted, extra, not_found
 
 HEAD = b"\xa3\x95"
 FMT = 0x80
 """The number of the messages that describe the others."""
 FMT_BODY = struct.Struct("<BB4s16s64s")
 HEADER = ","
-"""What the first three bytes of a message are called here, as no column can be."""
+"""Our name for the first three bytes of a message; no column can have it."""
 CHUNK_BYTES = 1 << 20
+"""Read at a time: 1 MiB."""
 BATCH_BYTES = 1 << 16
+"""Collected of one kind before it is decoded by numpy: 64 KiB, some hundred messages or more."""
 
 Alphabet = Mapping[str, tuple[str, float | None, type]]
 """A letter of a layout: its code in `struct`, its scale, and its type in Python; pymavlink's."""
@@ -35,10 +37,10 @@ Alphabet = Mapping[str, tuple[str, float | None, type]]
 
 @dataclass(frozen=True)
 class Layout:
-    """What one kind of message looks like.
+    """The layout of one kind of message.
 
     Attributes:
-        name: as the log calls it.
+        name: its name in the log.
         rows: one message, header included.
         scales: columns that are stored as scaled integers, and their scales.
     """
@@ -57,13 +59,13 @@ class Layout:
         return self.rows[column].kind in "iuf"
 
     def values(self, rows: NDArray[Any], column: str) -> NDArray[Any]:
-        """Return (n,): a column as the log means it; divided as pymavlink divides, so to the same bits."""
+        """Return (n,): a column, scaled by the same division as pymavlink's, for equal bits."""
         scale = self.scales.get(column)
         return rows[column].copy() if scale is None else rows[column] / (1 / scale)
 
 
 def parse_format(message: bytes, alphabet: Alphabet) -> tuple[int, Layout] | None:
-    """Return the number and the layout that an FMT message gives; None where it contradicts itself."""
+    """Return the number and the layout of an FMT message; None if it contradicts itself."""
     number, length, *texts = FMT_BODY.unpack(message[3:])
     name, letters, columns = (text.split(b"\0")[0].decode("latin-1") for text in texts)
     names = columns.split(",") if columns else []
@@ -85,20 +87,20 @@ def _numpys(code: str) -> str:
 
 
 class ArduPilotRecording(Recording):
-    """An ArduPilot dataflash log (.BIN). A message's sender is its instance, where the log says which field that is.
+    """An ArduPilot dataflash log (.BIN). A message's sender is its instance, if the log names the field of it.
 
-    Values are as pymavlink gives them: latitudes and longitudes in degrees, what is stored in hundredths divided by
-    100; the multipliers of FMTU concern units only and are not applied (GMS stays milliseconds).
+    Values are those of pymavlink: latitudes and longitudes in degrees, hundredths divided by 100. The multipliers of
+    FMTU concern units only and are not applied (GMS stays in milliseconds).
     """
 
     host_clock: ClassVar = ("TimeUS", "us")
     suffixes: ClassVar = (".bin",)
 
     def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
-        """Read the messages asked for; see `Recording.read`.
+        """Read the wanted messages; see `Recording.read`.
 
         Raises:
-            DatasetError: besides, a field that is no number, or a message of several instances of which none is chosen.
+            DatasetError: also for a field that is not a number, or several instances of which none is chosen.
         """
         where = str(self.path(folder))
         scan = _Scan(frozenset(want.message for want in wanted))
@@ -109,12 +111,12 @@ class ArduPilotRecording(Recording):
                     one.add(batch, where)
         for one in kept:
             if one.want.message not in scan.counts:
-                raise not_held(where, "message", one.want.message, scan.counts)
+                raise not_found(where, "message", one.want.message, scan.counts)
         return Messages([one.columns(where) for one in kept], scan.notes())
 
-    def contents(self, folder: Path) -> list[Held]:
-        """Return the messages that the log holds, by name and instance."""
-        found: dict[tuple[str, int | None], Held] = {}
+    def contents(self, folder: Path) -> list[TopicInfo]:
+        """Return the messages of the log, by name and instance."""
+        found: dict[tuple[str, int | None], TopicInfo] = {}
         times: dict[tuple[str, int | None], tuple[int, int]] = {}
         for batch in _Scan(None).batches(self.path(folder)):
             senders = batch.senders()
@@ -126,13 +128,13 @@ class ArduPilotRecording(Recording):
                     stamps = [int(rows["TimeUS"].min()), int(rows["TimeUS"].max()), *times.get(key, ())]
                     times[key] = (min(stamps), max(stamps))
                 first, last = times.get(key, (0, 0))
-                found[key] = Held(batch.layout.name, "", count, (last - first) * 1e-6, batch.layout.fields, sender)
+                found[key] = TopicInfo(batch.layout.name, "", count, (last - first) * 1e-6, batch.layout.fields, sender)
         return [found[key] for key in sorted(found, key=lambda k: (k[0], k[1] or 0))]
 
 
 @dataclass(frozen=True)
 class _Batch:
-    """Some messages of one kind, in the order of the file; `sender_field` tells them apart, where there is one."""
+    """Some messages of one kind, in the order of the file; `sender_field` holds the instance, if there are several."""
 
     layout: Layout
     rows: NDArray[Any]
@@ -143,7 +145,7 @@ class _Batch:
 
 
 class _Kept:
-    """What is kept of one Wanted, batch by batch."""
+    """The columns of one `Wanted`, collected batch by batch."""
 
     def __init__(self, want: Wanted) -> None:
         self.want = want
@@ -155,7 +157,7 @@ class _Kept:
         layout, rows, senders = batch.layout, batch.rows, batch.senders()
         for column in self.want.columns:
             if column not in layout.fields:
-                raise not_held(where, f"field of {layout.name} called", column, layout.fields)
+                raise not_found(where, f"field of {layout.name} called", column, layout.fields)
             if not layout.is_number(column):
                 raise DatasetError(f"{where}: {layout.name}.{column} is not a number; choose another field")
         if senders is not None:
@@ -182,8 +184,8 @@ class _Scan:
     """One pass over one file.
 
     Attributes:
-        names: messages to hand over; all of them where None.
-        counts: whole messages met so far, by name.
+        names: messages to yield; None for all.
+        counts: whole messages read so far, by name.
     """
 
     names: frozenset[str] | None
@@ -200,7 +202,7 @@ class _Scan:
         """Yield the messages, some of one kind at a time, each kind in the order of the file.
 
         Raises:
-            DatasetError: it cannot be opened, or holds not one whole message.
+            DatasetError: it cannot be opened, or contains no whole message.
         """
         with extra("ardupilot"):
             from pymavlink.DFReader import FORMAT_TO_STRUCT
@@ -232,15 +234,15 @@ class _Scan:
                     if len(buffer) >= BATCH_BYTES:
                         yield from self._flushed(number, buffers)
         if not whole:
-            raise DatasetError(f"{path}: not one whole dataflash message in it; is it an ArduPilot log (.BIN)?")
+            raise DatasetError(f"{path}: contains no whole dataflash message; is it an ArduPilot log (.BIN)?")
         for number in list(buffers):
             yield from self._flushed(number, buffers)
 
     def notes(self) -> tuple[str, ...]:
-        """Return what was passed over, in sentences."""
+        """Return what was skipped, one sentence each."""
         told = [
-            (self._gaps, f"ardupilot: {self._gaps} stretches, {self._skipped} bytes, of no whole message passed over"),
-            (self._unsound, f"ardupilot: {self._unsound} FMT messages that contradict themselves passed over"),
+            (self._gaps, f"ardupilot: {self._gaps} stretches, {self._skipped} bytes, of no whole message skipped"),
+            (self._unsound, f"ardupilot: {self._unsound} FMT messages that contradict themselves skipped"),
             (self._cut_off is not None, f"ardupilot: the file ends inside a message{self._cut_off}"),
         ]
         return tuple(note for count, note in told if count)
@@ -252,7 +254,7 @@ class _Scan:
             self._sender_fields.pop(number, None)
 
     def _name_sender(self, layout: Layout, message: bytes) -> None:
-        """Take from an FMTU message which field tells the instances of a kind apart: the one whose unit is '#'."""
+        """Take from an FMTU message the field that holds the instance of a kind: the one whose unit is '#'."""
         row = np.frombuffer(message, layout.rows)[0]
         if {"FmtType", "UnitIds"} <= set(layout.fields) and layout.rows["UnitIds"].kind == "S":
             described = self._layouts.get(int(row["FmtType"])) if layout.is_number("FmtType") else None
@@ -271,7 +273,7 @@ class _Scan:
         yield _Batch(layout, np.frombuffer(buffer, layout.rows), sender_field)
 
     def _messages(self, stream: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-        """Yield the number and the bytes of every whole message of a layout known by then."""
+        """Yield the number and the bytes of every whole message whose layout has been defined before it."""
         data, at, final, in_gap = b"", 0, False, False
         while not final:
             try:

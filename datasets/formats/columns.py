@@ -1,4 +1,4 @@
-"""Read columns of numbers out of tables: delimited text or Parquet, values as they stand in the file."""
+"""Read columns of numbers from tables: delimited text, Parquet or NumPy arrays, without conversion of units."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from ..errors import DatasetError, nearest, nearest_file
 EXACT: dict[str, Any] = (
     {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
 )
-"""Asks pandas for the nearest float64 of what is written; 3.1 reads so anyway (tried), and warns of the question."""
+"""Makes pandas read the nearest float64 of the text; 3.1 does so by default (tested), and warns about the option."""
 
 BOOLEANS = {"true": 1, "True": 1, "TRUE": 1, "false": 0, "False": 0, "FALSE": 0}
-"""As pandas reads a column of nothing else; here they may stand beside numbers, or it would hang on the pieces."""
+"""As pandas reads a column of these alone; a file is read piece by piece, so here they may be mixed with numbers."""
 PIECE_BYTES = 1 << 18
+"""Of text at a time; larger pieces were not faster, and cost memory."""
 PIECE_ROWS = 1 << 14
+"""Rows at a time, about as much."""
 TEXT = np.dtypes.StringDType(na_object=np.nan)
 
 Column = int | str
 
 
 class Part(BaseModel):
-    """A part of a description: frozen, and an unknown key is an error."""
+    """A part of a description: frozen; an unknown key is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -41,11 +43,11 @@ class Table(Part):
     file: str | None = None
     """Path inside the folder of the recording."""
     arrays: dict[str, str] = {}
-    """Instead of a file: NumPy arrays of one length, name to path; a two-dimensional one gives `name.0`, `name.1`…"""
+    """Instead of a file: NumPy arrays of equal length, name to path; a two-dimensional one gives `name.0`, `name.1`…"""
     delimiter: str = ","
     """Between fields; "whitespace" is any run of blanks and tabs."""
     comment: str = ""
-    """Lines that begin with this are passed over; so are empty ones."""
+    """Lines that begin with this are skipped, as are empty ones."""
     encoding: str = "utf-8"
     header: bool = True
     """Whether the first line names the columns; without, a column is its index, from 0."""
@@ -61,7 +63,7 @@ Columns = dict[Column, NDArray[Any]]
 
 
 def read_table(folder: Path, table: Table, columns: Collection[Column], times: Collection[Column] = ()) -> Columns:
-    """Return the named columns as float64 arrays; those in `times` as they are written (text, integers or floats).
+    """Return the named columns as float64 arrays; those in `times` unconverted (text, integers or floats).
 
     The file is read piece by piece, and only these columns are kept.
 
@@ -91,7 +93,7 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
 def _stacked(
     pieces: Iterable[pd.DataFrame], wanted: Collection[Column], times: Collection[Column], path: Path
 ) -> Columns:
-    """Return the columns wanted of a table that comes in pieces, a piece at least."""
+    """Return the wanted columns of a table that is read in one or more pieces."""
     kept: dict[Column, list[NDArray[Any]]] = {column: [] for column in wanted}
     row = 0
     for piece in pieces:
@@ -102,17 +104,17 @@ def _stacked(
     return {column: np.concatenate(kept.pop(column)) for column in wanted}
 
 
-def _check_held(wanted: Iterable[Column], found: Sequence[Column], path: Path) -> None:
+def _check_columns(wanted: Iterable[Column], found: Sequence[Column], path: Path) -> None:
     for column in wanted:
         if found.count(column) > 1:
-            raise DatasetError(f"{path}: {found.count(column)} columns are called {column!r}")
+            raise DatasetError(f"{path}: {found.count(column)} columns are named {column!r}")
         if column not in found:
             named = ", ".join(str(c) for c in found[:40])
             raise DatasetError(f"{path}: no column {column!r}{nearest(str(column), map(str, found))}; found {named}")
 
 
 def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Column]) -> Columns:
-    """Read NumPy arrays of one length; `name.0`, `name.1` are the columns of a two-dimensional one."""
+    """Read NumPy arrays of equal length; `name.0`, `name.1` are the columns of a two-dimensional one."""
     found: dict[str, NDArray[Any]] = {}
     for name, file in arrays.items():
         path = folder / file
@@ -127,8 +129,8 @@ def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Col
         found |= {name: values} if values.ndim == 1 else {f"{name}.{i}": values[:, i] for i in range(values.shape[1])}
     lengths = {name: len(values) for name, values in found.items()}
     if len(set(lengths.values())) > 1:
-        raise DatasetError(f"{folder}: arrays that stand side by side must be of one length, found {lengths}")
-    _check_held(map(str, wanted), list(found), folder)
+        raise DatasetError(f"{folder}: the arrays must be of equal length, found {lengths}")
+    _check_columns(map(str, wanted), list(found), folder)
     return {column: np.array(found[str(column)]) for column in dict.fromkeys(wanted)}
 
 
@@ -136,7 +138,7 @@ def _parquet_pieces(path: Path, wanted: Iterable[Column]) -> Iterator[pd.DataFra
     import pyarrow.parquet as pq
 
     with pq.ParquetFile(path, buffer_size=PIECE_BYTES, pre_buffer=False) as file:
-        _check_held(wanted, file.schema_arrow.names, path)
+        _check_columns(wanted, file.schema_arrow.names, path)
         names = [str(column) for column in wanted]
         if not file.metadata.num_rows:
             yield pd.DataFrame({name: np.zeros(0) for name in names})
@@ -158,11 +160,11 @@ class _Lines(io.TextIOBase):
         return bool(line.strip()) and not (self.comment and line.startswith(self.comment))
 
     def one(self) -> str:
-        """Return the next line that counts; "" at the end."""
+        """Return the next line of data; "" at the end."""
         return next(filter(self._counts, self.file), "")
 
     def read(self, size: int | None = -1) -> str:
-        """Return some whole lines that count; "" at the end."""
+        """Return some whole lines of data; "" at the end."""
         text, self.ahead = self.ahead, ""
         while not text and (lines := self.file.readlines(PIECE_BYTES)):
             text = "".join(filter(self._counts, lines))
@@ -195,7 +197,7 @@ def _frames(
     if table.header:
         head = pd.read_csv(io.StringIO(lines.read()), sep=separator, header=None, dtype=str, keep_default_na=False)
         names = [str(name).strip() for name in head.iloc[0]]
-        _check_held(wanted, names, path)
+        _check_columns(wanted, names, path)
         lines.ahead = lines.one()
         if not lines.ahead:
             yield pd.DataFrame({name: np.zeros(0) for name in names})
@@ -214,7 +216,7 @@ def _frames(
     with reader:
         for frame in reader:
             if names is None:
-                _check_held(wanted, list(frame.columns), path)
+                _check_columns(wanted, list(frame.columns), path)
             else:
                 if len(frame.columns) == len(names) + 1 and frame.iloc[:, -1].isna().all():
                     frame = frame.iloc[:, :-1]  # every row ends in a delimiter
@@ -227,7 +229,7 @@ def _frames(
 
 
 def _undecoded(path: Path, encoding: str) -> DatasetError:
-    """Return the error for a file that is not of this encoding: which byte is not."""
+    """Return the error for a file that is not in this encoding, with the first wrong byte."""
     decoder = codecs.getincrementaldecoder(encoding)()
     at, final = 0, False
     with path.open("rb") as file:
@@ -239,7 +241,9 @@ def _undecoded(path: Path, encoding: str) -> DatasetError:
             try:
                 decoder.decode(chunk, final)
             except UnicodeDecodeError as error:
-                at += len(chunk) - len(error.object) + error.start  # its object begins with what was left over
+                at += (
+                    len(chunk) - len(error.object) + error.start
+                )  # its object begins with the bytes left over from before
                 break
             at += len(chunk)
     guess = "utf-16" if start in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
@@ -247,7 +251,7 @@ def _undecoded(path: Path, encoding: str) -> DatasetError:
 
 
 def _as_written(series: pd.Series) -> NDArray[Any]:
-    """Return integers and floats as they are, and anything else as text; NaN where there is nothing."""
+    """Return integers and floats unchanged, and anything else as text; NaN for an empty field."""
     values = series.to_numpy()
     if values.dtype.kind != "O":
         return values
@@ -257,7 +261,7 @@ def _as_written(series: pd.Series) -> NDArray[Any]:
 
 
 def _numbers(series: pd.Series, path: Path, first_row: int) -> NDArray[Any]:
-    """Return float64; an integer too long for it keeps its nearest float, and true is 1."""
+    """Return float64: the nearest float of a long integer, and 1 for true."""
     if pd.api.types.is_numeric_dtype(series.dtype):
         return series.to_numpy(dtype=float, na_value=np.nan)
     plain = series.map(lambda value: BOOLEANS.get(value, value))

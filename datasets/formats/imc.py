@@ -1,7 +1,7 @@
 """IMC logs (LSF), the format of the LSTS toolchain: concatenated little-endian messages with a CRC each.
 
-The file is read in chunks, straight out of an archive where it is in one, and only the messages asked for are kept.
-A message whose CRC is wrong is passed over, and reading goes on at the next sync word.
+The file is read in chunks, also from within an archive, and only the wanted messages are kept. A message with a wrong
+CRC is skipped, and reading goes on at the next sync word.
 """
 
 from __future__ import annotations
@@ -21,17 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, nearest, nearest_file
-from .recording import Held, Messages, Recording, Wanted, not_held
+from .recording import Messages, Recording, TopicInfo, Wanted, not_found
 
 HEADER = np.dtype(
     [("sync", "<u2"), ("id", "<u2"), ("size", "<u2"), ("timestamp", "<f8"), ("src", "<u2"), ("src_ent", "u1"),
      ("dst", "<u2"), ("dst_ent", "u1")]
 )  # fmt: skip
 CHUNK_BYTES = 1 << 20
+"""Read at a time: 1 MiB."""
+"""Read at a time: 1 MiB."""
 TYPES = {"int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
          "int64_t": "<i8", "fp32_t": "<f4", "fp64_t": "<f8"}  # fmt: skip
 BROKEN = (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, ValueError)
-"""What the standard library raises on a damaged archive."""
+"""The exceptions of the standard library for a damaged archive."""
 
 _XYZ = "time:f8 x:f8 y:f8 z:f8"
 _ESTIMATE = (
@@ -50,7 +52,7 @@ BUILT_IN = {
     "Depth": (265, "value:f4"),
     "EstimatedState": (350, _ESTIMATE),
 }
-"""Messages of IMC 5.4, for logs without their definitions."""
+"""Messages of IMC 5.4: number and fields, for logs without their definitions."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +65,14 @@ class Layout:
 
 @dataclass(frozen=True)
 class LsfRead:
-    """What a file held: per message name its rows (header's timestamp, src_ent, and the fields), and notes."""
+    """The contents of a file: per message name its rows (header's timestamp, src_ent, and the fields), and notes."""
 
     rows: dict[str, NDArray[Any]]
     notes: tuple[str, ...]
 
 
 def built_in_layouts() -> dict[str, Layout]:
-    """Return the messages known without a definitions file."""
+    """Return the layouts of the built-in messages."""
     layouts = {}
     for name, (mgid, fields) in BUILT_IN.items():
         dtype = np.dtype([(f.split(":")[0], "<" + f.split(":")[1]) for f in fields.split()])
@@ -79,7 +81,7 @@ def built_in_layouts() -> dict[str, Layout]:
 
 
 def parse_definitions(xml: bytes, where: str) -> dict[str, Layout]:
-    """Return the messages of an IMC.xml; a message is cut before its first field of variable size."""
+    """Return the layouts of the messages of an IMC.xml, up to the first field of variable size."""
     try:
         root = ET.fromstring(xml)
         layouts = {}
@@ -104,12 +106,12 @@ class ImcRecording(Recording):
     member: str | None = None
     """Its path inside the archive."""
     definitions: str | None = None
-    """IMC.xml or IMC.xml.gz, inside the same archive or folder; a short built-in list when left out."""
+    """IMC.xml or IMC.xml.gz, inside the same archive or folder; a short built-in list if left out."""
     source: int | None = None
     """Keep only messages with this `src`."""
 
     def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
-        """Read the messages asked for; see `Recording.read`."""
+        """Read the wanted messages; see `Recording.read`."""
         where = str(folder / self.file)
         layouts = self._layouts(folder)
         for want in wanted:
@@ -120,8 +122,8 @@ class ImcRecording(Recording):
             held = scan(stream, {want.message: layouts[want.message] for want in wanted}, self.source, where)
         return Messages([_columns(held.rows[want.message], want, where) for want in wanted], held.notes)
 
-    def contents(self, folder: Path) -> list[Held]:
-        """Return the messages that the log holds, by name and entity."""
+    def contents(self, folder: Path) -> list[TopicInfo]:
+        """Return the messages of the log, by name and entity."""
         layouts = self._layouts(folder)
         with _opened(folder, self.file, self.member) as stream:
             held = scan(stream, layouts, self.source, str(folder / self.file))
@@ -130,11 +132,11 @@ class ImcRecording(Recording):
             fields = tuple(n for n in rows.dtype.names or () if n not in ("timestamp", "src_ent"))
             for entity in np.unique(rows["src_ent"]).tolist():
                 stamps = rows["timestamp"][rows["src_ent"] == entity]
-                found.append(Held(name, "", len(stamps), float(np.ptp(stamps)), fields, entity))
+                found.append(TopicInfo(name, "", len(stamps), float(np.ptp(stamps)), fields, entity))
         return sorted(found, key=lambda h: (h.message, h.sender or 0))
 
     def _layouts(self, folder: Path) -> dict[str, Layout]:
-        """Return the message layouts of the log: its own definitions, else the built-in ones."""
+        """Return the message layouts of the log: from its own definitions, else the built-in ones."""
         if self.definitions is None:
             return built_in_layouts()
         in_archive = self.file.endswith(".zip")
@@ -149,7 +151,7 @@ class ImcRecording(Recording):
 
 
 def _columns(rows: NDArray[Any], want: Wanted, where: str) -> dict[str, NDArray[Any]]:
-    """Return the columns asked for, of the entity asked for, as float64."""
+    """Return the wanted columns of the wanted entity, as float64."""
     if want.sender is not None:
         entities = sorted(set(rows["src_ent"].tolist()))
         rows = rows[rows["src_ent"] == want.sender]
@@ -159,13 +161,13 @@ def _columns(rows: NDArray[Any], want: Wanted, where: str) -> dict[str, NDArray[
         raise DatasetError(f"{where}: no {want.message} in the log")
     for column in want.columns:
         if column not in (rows.dtype.names or ()):
-            raise not_held(where, f"field of {want.message} called", column, rows.dtype.names or ())
+            raise not_found(where, f"field of {want.message} called", column, rows.dtype.names or ())
     return {column: rows[column].astype(float) for column in want.columns}
 
 
 @contextmanager
 def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
-    """Open a file, or a member of an archive, as a stream of bytes; gunzipped where its name ends in .gz."""
+    """Open a file, or a member of an archive, as a stream of bytes; decompressed if its name ends in .gz."""
     path = folder / file
     if not path.is_file():
         raise DatasetError(f"{path}: no such file{nearest_file(path)}")
@@ -213,14 +215,14 @@ def scan(stream: IO[bytes], layouts: Mapping[str, Layout], source: int | None, w
         if len(offsets):
             short += _keep(data, offsets, layouts, source, rows)
     if messages == 0:
-        raise DatasetError(f"{where}: not one whole IMC message in it; is it an LSF log?")
+        raise DatasetError(f"{where}: contains no whole IMC message; is it an LSF log?")
     truncated = in_gap or bool(carry) or bool(cut_off)
     skipped += len(carry)
 
     notes = []
     corrupted = gaps - int(in_gap)
     if corrupted:
-        notes.append(f"imc: {corrupted} stretches of corrupted messages passed over")
+        notes.append(f"imc: {corrupted} stretches of corrupted messages skipped")
     if truncated:
         notes.append(f"imc: the file ends inside a message{cut_off}")
     if skipped:
@@ -281,8 +283,8 @@ CRC_TABLE = crc_table()
 def _messages(data, final, in_gap, table):  # pragma: no cover  (compiled)
     """Find the whole messages of a chunk.
 
-    Returns their offsets, how far the chunk is dealt with, how many stretches of bad bytes begin in it, how many bytes
-    were passed over, and whether it ends inside such a stretch.
+    Returns their offsets, the number of bytes processed, the number of stretches of bad bytes that begin in it, the
+    number of bytes skipped, and whether the chunk ends inside such a stretch.
     """
     n = len(data)
     offsets = np.empty(n // 22 + 1, np.int64)

@@ -1,7 +1,7 @@
 """MCAP files: messages in Protocol Buffers, ROS 2's CDR, ROS 1's bytes, or JSON.
 
-A file is read from front to back, chunk by chunk, and not by its index, which stands at its end and which a recorder
-that lost its power has not written.
+A file is read from front to back, chunk by chunk. Its index is not used: it is at the end of the file, and missing if
+the recorder lost its power.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, one_line
-from .recording import extra, not_held
+from .recording import extra, not_found
 from .ros_messages import Definitions, Types, definitions_of, ros_channel, short_name
-from .topics import NS, Channel, Found, Message, Misfit, ShortArray, TopicRecording
+from .topics import NS, Channel, MalformedMessage, Message, ScanResult, ShortArray, TopicRecording
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE = 3, 4, 5
-"""Kinds of records in a chunk, their opcode."""
+"""Opcodes of the records in a chunk (MCAP specification, "Records")."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
@@ -37,23 +37,23 @@ class McapRecording(TopicRecording):
     suffixes: ClassVar = (".mcap",)
     stamps: ClassVar = ("log_time", "publish_time")
 
-    def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+    def messages(self, folder: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
         """Yield the messages of a file; see `TopicRecording.messages`."""
         return mcap_messages(self.path(folder), {}, topics, found)
 
 
 def mcap_messages(
-    plain: Path, types: Types, topics: Collection[str] | None, found: Found, path: Path | None = None
+    plain: Path, types: Types, topics: Collection[str] | None, found: ScanResult, path: Path | None = None
 ) -> Iterator[Message]:
-    """Yield the messages of an MCAP file; what is damaged is passed over and told in `found.notes`.
+    """Yield the messages of an MCAP file; damaged parts are skipped and counted in `found.notes`.
 
     Args:
         plain: the file.
-        path: what errors call it, where that is not its path.
+        path: its name in errors, if different.
         types: definitions of ROS messages that the file does not define itself.
 
     Raises:
-        DatasetError: not an MCAP file, or not one whole message in it.
+        DatasetError: not an MCAP file, or it contains no whole message.
     """
     with extra("mcap"):
         from mcap.records import Chunk, Footer
@@ -101,16 +101,16 @@ def mcap_messages(
     if not finished:
         found.notes.append(f"{path.name}: damaged, or cut off: nothing is read from there on ({why})")
     if damaged:
-        found.notes.append(f"{path.name}: {damaged} damaged chunks or records passed over")
+        found.notes.append(f"{path.name}: {damaged} damaged chunks or records skipped")
     if not reading.whole:
         told = "; ".join(["", *found.notes])
-        raise DatasetError(f"{path}: not one whole message in it{told}")
+        raise DatasetError(f"{path}: contains no whole message{told}")
 
 
 class _Reading:
-    """What is known of a file while its records go by."""
+    """The schemas and channels of a file, while its records are read."""
 
-    def __init__(self, path: Path, types: Types, topics: Collection[str] | None, found: Found) -> None:
+    def __init__(self, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult) -> None:
         self.path, self.types, self.topics, self.found = path, types, topics, found
         self.schemas: dict[int, Any] = {}
         self.channels: dict[int, Channel] = {}
@@ -157,7 +157,7 @@ class _Reading:
             yield channel, (log_ns, publish_ns), data
 
     def define(self, record: Any) -> None:
-        """Take in a schema or a channel."""
+        """Register a schema or a channel."""
         from mcap.records import Channel as ChannelRecord
         from mcap.records import Schema
 
@@ -172,7 +172,7 @@ class _Reading:
 
 
 def _channel(record: Any, schema: Any, types: Types, path: Path) -> Channel:
-    """Return how the messages of a channel are read."""
+    """Return the channel of a record, with the reader of its messages."""
     where = f"{path}: {record.topic}"
     kind = "" if schema is None else schema.name
     if record.message_encoding in ("cdr", "ros1"):
@@ -222,7 +222,7 @@ def _protobuf_channel(topic: str, kind: str, schema: Any, where: str) -> Channel
 
 
 def _protobuf_fields(descriptor: Any, prefix: str, above: tuple[str, ...]) -> Iterator[str]:
-    """Yield the paths of a type's numbers; of a repeated field, that of its first element."""
+    """Yield the paths of a type's numeric fields; for a repeated field, that of its first element."""
     if descriptor.full_name in above:
         return  # a type may contain itself: it is listed once
     for field in descriptor.fields:
@@ -241,7 +241,7 @@ def _repeated(field: Any) -> bool:
 
 
 def _code(field: Any) -> str | None:
-    """Return the struct code of a number; None where it is none."""
+    """Return the struct code of a numeric field; None for another."""
     number = field.cpp_type
     floats, unsigned = (field.CPPTYPE_DOUBLE, field.CPPTYPE_FLOAT), (field.CPPTYPE_UINT64,)
     others = (field.CPPTYPE_STRING, field.CPPTYPE_MESSAGE)
@@ -249,16 +249,16 @@ def _code(field: Any) -> str | None:
 
 
 class ProtobufExtractor:
-    """Takes wanted numbers out of messages of one type of Protocol Buffers; an `Extractor`.
+    """Extracts wanted numbers from messages of one type of Protocol Buffers; an `Extractor`.
 
-    What a message leaves out and could have had is NaN; an integer or a time left out makes its message a misfit.
+    An absent float is NaN; a message without a wanted integer or time is malformed.
     """
 
     def __init__(self, decode: Callable[[bytes], Any], wanted: Sequence[str], where: str) -> None:
         """Compile the reader.
 
         Raises:
-            DatasetError: a column that is no number of the type (with the nearest).
+            DatasetError: a column that is not a numeric field of the type (with the nearest).
         """
         self._decode = decode
         descriptor = decode(b"").DESCRIPTOR
@@ -269,7 +269,7 @@ class ProtobufExtractor:
             steps, code = _protobuf_path(descriptor, column)
             if code is None:
                 known = _protobuf_fields(descriptor, "", ())
-                raise not_held(where, f"numeric field of {descriptor.full_name} called", column, known)
+                raise not_found(where, f"numeric field of {descriptor.full_name} called", column, known)
             self._paths.append((column, steps, code))
             self.codes.append("q" if code == "time" else code)
 
@@ -278,7 +278,7 @@ class ProtobufExtractor:
         try:
             message = self._decode(data)
         except Exception as error:  # protobuf's DecodeError, and what its versions raise besides
-            raise Misfit(f"{type(error).__name__}: {error}") from None
+            raise MalformedMessage(f"{type(error).__name__}: {error}") from None
         return [_protobuf_value(message, column, steps, code) for column, steps, code in self._paths]
 
     def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -287,11 +287,11 @@ class ProtobufExtractor:
 
 
 Path_ = tuple[tuple[str, bool, int | None], ...]
-"""Steps into a message: field, whether it may be absent, and the index into it where it is repeated."""
+"""Steps into a message: field, whether it may be absent, and the index if it is repeated."""
 
 
 def _protobuf_path(descriptor: Any, column: str) -> tuple[Path_, str | None]:
-    """Return the steps to a number and its code; None where there is no such number."""
+    """Return the steps to a number and its code; None if there is no such number."""
     steps: list[tuple[str, bool, int | None]] = []
     names = column.split(".")
     while names:
@@ -320,7 +320,7 @@ def _protobuf_value(message: Any, column: str, steps: Path_, code: str) -> Any:
         if optional and not value.HasField(name):
             if code == "d":
                 return np.nan
-            raise Misfit(f"it has no {column!r}")
+            raise MalformedMessage(f"it has no {column!r}")
         value = getattr(value, name)
         if index is not None:
             if index >= len(value):
@@ -333,7 +333,7 @@ def _protobuf_value(message: Any, column: str, steps: Path_, code: str) -> Any:
 
 
 class JsonExtractor:
-    """Takes wanted numbers out of JSON objects; an `Extractor`. A number left out, or null, is NaN."""
+    """Extracts wanted numbers from JSON objects; an `Extractor`. An absent number, or null, is NaN."""
 
     def __init__(self, wanted: Sequence[str], where: str) -> None:
         self._wanted, self._where = tuple(wanted), where
@@ -347,9 +347,9 @@ class JsonExtractor:
         try:
             message = json.loads(data)
         except (ValueError, RecursionError) as error:
-            raise Misfit(f"not JSON: {error}") from None
+            raise MalformedMessage(f"not JSON: {error}") from None
         if not isinstance(message, dict):
-            raise Misfit(f"not an object but {type(message).__name__}")
+            raise MalformedMessage(f"not an object but {type(message).__name__}")
         if self._shape is None:
             self._shape = message
         return [self._value(message, column, path) for column, path in zip(self._wanted, self._paths, strict=True)]
@@ -362,7 +362,7 @@ class JsonExtractor:
         """
         for column in self._wanted:
             if column not in self._met:
-                raise not_held(self._where, "numeric field called", column, _json_fields(self._shape or {}, ""))
+                raise not_found(self._where, "numeric field called", column, _json_fields(self._shape or {}, ""))
         return dict(zip(self._wanted, raw, strict=True))
 
     def _value(self, message: Any, column: str, path: Sequence[str]) -> int | float:
@@ -381,12 +381,12 @@ class JsonExtractor:
             self._met.add(column)
             return number
         if value is not None:
-            raise Misfit(f"{column!r} is no number")
+            raise MalformedMessage(f"{column!r} is no number")
         return np.nan
 
 
 def _json_number(value: Any) -> int | float | None:
-    """Return a number, or a time's nanoseconds; None where it is neither."""
+    """Return a number, or the nanoseconds of a time; None if it is neither."""
     if isinstance(value, int | float):
         return value if isinstance(value, float) else int(value)
     if isinstance(value, dict):

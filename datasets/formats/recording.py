@@ -1,8 +1,8 @@
-"""Recordings: formats whose files hold many kinds of messages, one loader each; other packages bring more.
+"""Recordings: files that hold many kinds of messages. The interface of their loaders, and the registry by format.
 
-A loader is the model of the part `recording` of a log.yaml: its fields are the keys that its format has there, and it
-reads what the streams ask for, in one pass from front to back, keeping nothing else. What the messages mean (units,
-frames, mountings, noise) stands in log.yaml, so a loader knows a file format and no vehicle.
+A loader is the model of the part `recording` of a log.yaml, and its fields are the keys of its format. It reads the
+messages that the streams need, in one pass from front to back, and keeps nothing else. Units, frames, mountings and
+noise are stated in log.yaml, so a loader knows a file format and no vehicle. Other packages can add loaders.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ LOADERS = {
     "mcap": "mcap_file:McapRecording",
     "ros": "ros_bag:RosRecording",
 }
-"""Our formats: module and class. Other people's join by the entry-point group `fathom.loaders`."""
+"""Our formats: module and class. Other packages add theirs by the entry-point group `fathom.loaders`."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a description asks of one kind of message.
+    """The columns that a description needs from one kind of message.
 
     Attributes:
         message: the message's name, or its topic.
-        sender: which of several senders of this name; any where None.
+        sender: which of several senders of this name; None for any.
         columns: fields of the message, and what the format adds to them.
     """
 
@@ -46,8 +46,8 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Held:
-    """A kind of message that a recording holds: its name, its type, how often, over which time (s), and its fields."""
+class TopicInfo:
+    """A kind of message in a recording: name, type, number of messages, time from first to last (s), and fields."""
 
     message: str
     kind: str
@@ -59,11 +59,11 @@ class Held:
 
 @dataclass(frozen=True)
 class Messages:
-    """What a recording gave.
+    """The messages read from a recording.
 
     Attributes:
-        columns: for each Wanted in turn, its columns by name, (n,) each; integers stay integers.
-        notes: what was passed over, in sentences.
+        columns: for each `Wanted`, its columns by name, (n,) each; integers stay integers.
+        notes: what was skipped, one sentence each.
     """
 
     columns: Sequence[Mapping[str, NDArray[Any]]]
@@ -71,16 +71,16 @@ class Messages:
 
 
 class Recording(BaseModel):
-    """A loader, configured: where the recording is and what its format wants to know.
+    """A configured loader: the file, and the keys of its format.
 
-    Subclasses add their format's keys and fill in `read` and `contents`.
+    Subclasses add their format's keys and implement `read` and `contents`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     host_clock: ClassVar[tuple[str, str]]
-    """The column of the host's stamps that every message of this format has, and its unit (s, ms, us or ns)."""
+    """The column of host time stamps that every message of this format has, and its unit (s, ms, us or ns)."""
     suffixes: ClassVar[tuple[str, ...]] = ()
-    """How the names of such files end, in small letters."""
+    """Suffixes of such files, in lower case."""
 
     format: str
     file: str
@@ -91,22 +91,22 @@ class Recording(BaseModel):
         """Read the file once.
 
         Raises:
-            DatasetError: no such file, message, sender or field (with the nearest known), or not one whole message.
+            DatasetError: no such file, message, sender or field (with the nearest known), or no whole message.
         """
 
     @abstractmethod
-    def contents(self, folder: Path) -> list[Held]:
-        """Return what the file holds, in the order of its names.
+    def contents(self, folder: Path) -> list[TopicInfo]:
+        """Return the kinds of messages in the file, sorted by name.
 
         Raises:
             DatasetError: no such file, or not of this format.
         """
 
     def path(self, folder: Path) -> Path:
-        """Return where the recording lies.
+        """Return the path of the recording.
 
         Raises:
-            DatasetError: it is not there; names the nearest file that is.
+            DatasetError: it does not exist; names the nearest file that does.
         """
         path = folder / self.file
         if not path.exists():
@@ -115,12 +115,12 @@ class Recording(BaseModel):
 
 
 def known_formats() -> list[str]:
-    """Return the names of our formats and of those that installed packages bring."""
+    """Return the names of our formats and of those from installed packages."""
     return sorted(LOADERS.keys() | _plugins().keys())
 
 
 def loader(name: object) -> type[Recording]:
-    """Return the loader of a format, ours or an installed package's; ours win.
+    """Return the loader of a format, ours or an installed package's; ours take precedence.
 
     Raises:
         DatasetError: unknown format (with the nearest known one), or its package cannot be loaded.
@@ -134,14 +134,14 @@ def loader(name: object) -> type[Recording]:
     point = _plugins()[str(name)]
     try:
         return point.load()
-    except Exception as error:  # whatever somebody's module does when it is imported
+    except Exception as error:  # importing a foreign module may raise anything
         raise DatasetError(f"format {name!r}: {not_loaded(point, error)}") from error
 
 
 def recording_at(path: Path) -> Recording | None:
-    """Return the loader of a file that nobody has described, by how its name ends; None where that tells nothing."""
+    """Return the loader of a file without a log.yaml, by its suffix; None for an unknown suffix."""
     others = sorted(_plugins().keys() - LOADERS.keys())
-    for name in [*LOADERS, *others]:  # nobody else's package is imported where ours can help
+    for name in [*LOADERS, *others]:  # other packages are imported only if none of ours fits
         kind = loader(name)
         if path.name.lower().endswith(kind.suffixes or ("\0",)):
             return kind(format=name, file=path.name)
@@ -154,7 +154,7 @@ def _plugins() -> dict[str, EntryPoint]:
 
 @contextmanager
 def extra(name: str) -> Iterator[None]:
-    """Name the extra that is missed when an import inside fails.
+    """Name the missing extra when an import inside fails.
 
     Raises:
         DatasetError: instead of ImportError.
@@ -165,8 +165,8 @@ def extra(name: str) -> Iterator[None]:
         raise DatasetError(f"{error}; this format needs an extra: pip install 'fathom-bench[{name}]'") from None
 
 
-def not_held(where: str, what: str, name: str, known: Iterable[str]) -> DatasetError:
-    """Return the error for a message or field that is not there: "no topic '/imu'; did you mean '/imu/data'?"."""
+def not_found(where: str, what: str, name: str, known: Iterable[str]) -> DatasetError:
+    """Return the error for an unknown message or field: "no topic '/imu'; did you mean '/imu/data'?"."""
     names = sorted(map(str, known))
     found = ", ".join(names[:40]) + (", …" if len(names) > 40 else "")
     return DatasetError(f"{where}: no {what} {name!r}{nearest(name, names)}; found {found or 'none'}")

@@ -1,8 +1,8 @@
 """ROS 1 bags (.bag) and ROS 2 bags (a folder, .db3 or .mcap), without ROS.
 
-ROS 1 bags are read from front to back and not by their index, which stands at their end: a recorder that lost its
-power has not written it. ROS 2 bags in SQLite seldom carry the definitions of their messages; those of ROS itself
-come with `rosbags`, by distribution, and those of common DVLs with this package.
+ROS 1 bags are read from front to back, without their index: it is at the end, and missing if the recorder lost its
+power. ROS 2 bags in SQLite seldom contain the definitions of their messages. Those of ROS itself come with `rosbags`,
+by distribution, and those of common DVLs with this package.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from ..errors import DatasetError, nearest, nearest_file
 from .mcap_file import mcap_messages
 from .recording import extra
 from .ros_messages import Definition, Definitions, Types, definitions_of, parse_definitions, ros_channel, short_name
-from .topics import NS, Channel, Found, Message, TopicRecording
+from .topics import NS, Channel, Message, ScanResult, TopicRecording
 
 MAGIC_1 = b"#ROSBAG V2.0\n"
 MESSAGE_DATA, CHUNK, CONNECTION = 2, 5, 7
-"""Kinds of records of a ROS 1 bag, their `op`."""
+"""Values of `op`, the kind of a record of a ROS 1 bag."""
 DISTRO = "humble"
-"""The ROS 2 distribution whose definitions are taken where a bag does not name one."""
+"""The ROS 2 distribution whose definitions are used if a bag does not name one."""
 _U32 = struct.Struct("<I")
 
 
 class RosRecording(TopicRecording):
-    """A ROS bag, version 1 or 2, as it is found. Messages are topics; `log_time` is when each was recorded."""
+    """A ROS bag, version 1 or 2. Messages are topics; `log_time` is when each was recorded."""
 
     host_clock = ("log_time", "ns")
     suffixes = (".bag", ".bag.active", ".db3")
@@ -42,11 +42,11 @@ class RosRecording(TopicRecording):
     more: tuple[str, ...] = ()
     """Further files of a split ROS 1 bag, in their order; the folder of a ROS 2 bag names its own."""
     distro: str | None = None
-    """ROS 2 distribution whose definitions count where the bag has none; by default the bag's own, else humble."""
+    """ROS 2 distribution whose definitions are used for a bag without its own; by default the bag's, else humble."""
     definitions: tuple[str, ...] = ()
     """Files of further definitions: `…/package/msg/Name.msg`, or many in one, under lines `MSG: package/Name`."""
 
-    def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
+    def messages(self, folder: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
         """Yield the messages of a bag; see `TopicRecording.messages`."""
         path = self.path(folder)
         if path.name == "metadata.yaml":
@@ -63,7 +63,7 @@ class RosRecording(TopicRecording):
 
 
 def own_definitions(folder: Path, files: Sequence[str]) -> dict[str, Definition]:
-    """Return the definitions in files of the user's."""
+    """Return the definitions in the user's files."""
     types: dict[str, Definition] = {}
     for file in files:
         path = folder / file
@@ -79,16 +79,16 @@ def own_definitions(folder: Path, files: Sequence[str]) -> dict[str, Definition]
 
 @cache
 def shipped_definitions() -> dict[str, Definition]:
-    """Return the definitions of common DVLs, which ROS does not bring along."""
+    """Return the definitions of common DVLs, which are not part of ROS."""
     path = Path(__file__).parent / "ros_definitions" / "dvl.msg"
     return parse_definitions(path.read_text(encoding="utf-8"), "", str(path))
 
 
 class _Distribution(dict[str, Definition]):
-    """Definitions that a ROS 2 distribution brings, looked up when they are asked for."""
+    """Definitions of a ROS 2 distribution, looked up on demand."""
 
     def __init__(self, asked: str | None, recorded: str, where: str) -> None:
-        """`asked` is the user's; else that of the recording counts where it is known (it may say `rolling`)."""
+        """`asked` is the user's distribution; without one, that of the recording is used, if known."""
         super().__init__()
         self._asked, self._recorded, self._where = asked, recorded, where
 
@@ -115,11 +115,11 @@ class _Distribution(dict[str, Definition]):
 # ------------------------------------------------------------------------------------------------------------- ROS 1
 
 
-def ros1_messages(path: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
-    """Yield the messages of a ROS 1 bag; what is damaged is passed over and told in `found.notes`.
+def ros1_messages(path: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
+    """Yield the messages of a ROS 1 bag; damaged parts are skipped and counted in `found.notes`.
 
     Raises:
-        DatasetError: not a ROS 1 bag of version 2.0, or not one whole message in it.
+        DatasetError: not a ROS 1 bag of version 2.0, or contains no whole message.
     """
     size = path.stat().st_size
     bag = _Bag(path, topics, found)
@@ -149,17 +149,17 @@ def ros1_messages(path: Path, topics: Collection[str] | None, found: Found) -> I
             at = start + length
             stream.seek(at)
     if not bag.whole:
-        raise DatasetError(f"{path}: not one whole message in it{'; ' if found.notes else ''}{'; '.join(found.notes)}")
+        raise DatasetError(f"{path}: contains no whole message{'; ' if found.notes else ''}{'; '.join(found.notes)}")
     if bag.damaged:
         found.notes.append(
-            f"{path.name}: {bag.damaged} damaged chunks or records; what cannot be read of them is passed over"
+            f"{path.name}: {bag.damaged} damaged chunks or records; what cannot be read of them is skipped"
         )
 
 
 class _Bag:
-    """What is known of a ROS 1 bag while its records go by."""
+    """The connections of a ROS 1 bag, while its records are read."""
 
-    def __init__(self, path: Path, topics: Collection[str] | None, found: Found) -> None:
+    def __init__(self, path: Path, topics: Collection[str] | None, found: ScanResult) -> None:
         self.path, self.topics, self.found = path, topics, found
         self.connections: dict[bytes, Channel] = {}
         self.whole = self.damaged = 0
@@ -275,7 +275,7 @@ def _decompressed(compression: bytes, data: bytes) -> bytes:
 
 
 def _ros2_messages(
-    path: Path, types: Types, distro: str | None, topics: Collection[str] | None, found: Found
+    path: Path, types: Types, distro: str | None, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
     about = _metadata(path) if path.is_dir() else {}
     files = _files(path, about) if path.is_dir() else [path]
@@ -298,7 +298,7 @@ def _ros2_messages(
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """Return what metadata.yaml says; a recorder that did not finish has not written it."""
+    """Return the contents of metadata.yaml; empty if the recorder did not finish and write it."""
     file = path / "metadata.yaml"
     if not file.is_file():
         return {}
@@ -346,7 +346,7 @@ def _uncompressed(file: Path) -> Iterator[Path]:
 
 
 def _zstd(data: bytes) -> bytes:
-    """Return a message decompressed; one that is damaged is empty, and no message of its type."""
+    """Return a message decompressed; a damaged one is empty, which does not fit its type."""
     with extra("ros"):
         import zstandard
     try:
@@ -356,9 +356,9 @@ def _zstd(data: bytes) -> bytes:
 
 
 def _sqlite_messages(
-    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: Found
+    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
-    """Yield the messages of a SQLite database; `path` is what errors call it, `plain` where it lies uncompressed."""
+    """Yield the messages of a SQLite database; `path` is its name in errors, `plain` the uncompressed file."""
     row = before = 0
     try:
         with closing(sqlite3.connect(f"{plain.resolve().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
@@ -413,7 +413,7 @@ def _cdr_channel(topic: str, kind: str, carried: tuple[str, str] | None, types: 
 
 
 def _mcap_messages(
-    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: Found
+    plain: Path, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
     for channel, (log_ns, _), data in mcap_messages(plain, types, topics, found, path):
         yield channel, (log_ns,), data

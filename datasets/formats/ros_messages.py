@@ -1,8 +1,8 @@
-"""ROS messages: definitions as text, and readers compiled from them that take single numbers out of the bytes.
+"""ROS messages: definitions as text, and readers built from them that extract single numbers from the bytes.
 
 A definition is the text of a .msg file, alone or joined with those that it needs by lines of "===", as recordings
-carry them. Bytes are those of ROS 1, or plain CDR, which is ROS 2's. Fields of fixed size are read in runs, by one
-`struct` each; what is not wanted is stepped over, and the message must end where its definition does.
+contain them. The bytes are those of ROS 1, or plain CDR for ROS 2. Consecutive fields of fixed size are read by one
+`struct`; other fields are skipped, and the message must end where its definition does.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, one_line
-from .recording import extra, not_held
-from .topics import NS, Channel, Misfit, ShortArray
+from .recording import extra, not_found
+from .topics import NS, Channel, MalformedMessage, ShortArray
 
 CODES = {"bool": "B", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
          "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d"}  # fmt: skip
 TIMES = {"time", "duration", "builtin_interfaces/Time", "builtin_interfaces/Duration"}
-"""Seconds and nanoseconds: one number, in nanoseconds."""
+"""Seconds and nanoseconds, read as one number of nanoseconds."""
 STRINGS = {"string", "wstring"}
 MOST_FIELDS = 100_000
-"""No message of anybody's has more; a damaged definition may."""
+"""More than any real message has; a damaged definition may have more."""
 
 _LINE = re.compile(
     r"(?P<base>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<most><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)"
@@ -46,7 +46,7 @@ Serialisation = Literal["ros1", "cdr"]
 
 
 class Definitions(dict[str, Definition]):
-    """Definitions by their short names, out of several sources: the first that has one counts."""
+    """Definitions by their short names, from several sources; the first source with a name is used."""
 
     def __init__(self, *sources: Types) -> None:
         super().__init__()
@@ -69,10 +69,10 @@ def short_name(kind: str) -> str:
 
 
 def parse_definitions(text: str, kind: str, where: str) -> dict[str, Definition]:
-    """Return the definitions that a text holds by their short names; `kind` is what the first one is called.
+    """Return the definitions in a text by their short names; `kind` is the name of the first one.
 
     Raises:
-        DatasetError: a line is none of a definition's.
+        DatasetError: a line is not part of a definition.
     """
     types: dict[str, Definition] = {}
     name, fields = short_name(kind), []
@@ -107,7 +107,7 @@ def _field(line: str, kind: str, where: str) -> Field | None:
 
 
 def definitions_of(text: str, encoding: str, kind: str, where: str) -> dict[str, Definition]:
-    """Return the definitions that a recording carries for one type, written as `ros1msg`, `ros2msg` or `ros2idl`.
+    """Return the definitions that a recording contains for one type, as `ros1msg`, `ros2msg` or `ros2idl`.
 
     Raises:
         DatasetError: cannot be understood.
@@ -203,23 +203,23 @@ class RosExtractor:
         absent = [column for column in wanted if column not in self._leaves]
         if absent:
             known = numeric_fields(types, kind, where)
-            raise not_held(where, f"numeric field of {kind} called", absent[0], known)
+            raise not_found(where, f"numeric field of {kind} called", absent[0], known)
         self.codes = [code for leaf in self._leaves.values() for code in leaf.codes]
 
     def __call__(self, data: bytes) -> list[Any]:
-        """Return the numbers, in the order in which they stand in the message."""
+        """Return the numbers, in the order of the message."""
         out: list[Any] = []
         if not self._cdr:
             end = self._steps["<"](data, 0, out)
             spare = len(data) - end
         else:
             if len(data) < 4 or data[0] != 0 or data[1] > 1:
-                raise Misfit(f"not plain CDR: it begins with {data[:4].hex()}")
+                raise MalformedMessage(f"not plain CDR: it begins with {data[:4].hex()}")
             spare = len(data) - self._steps["<" if data[1] else ">"](data, 4, out)
             if 0 < spare < 4:
                 spare = 0
         if spare:
-            raise Misfit(f"it is {len(data)} bytes long, by its definition {len(data) - spare}")
+            raise MalformedMessage(f"it is {len(data)} bytes long, by its definition {len(data) - spare}")
         return out
 
     def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -288,7 +288,7 @@ class _Plan:
         return leaf.codes, leaf.size, leaf.align
 
     def _indices(self, path: str) -> list[int]:
-        """Return which elements of an array are asked for."""
+        """Return the wanted indices of an array."""
         rests = (w.removeprefix(f"{path}.").partition(".")[0] for w in self.wanted if w.startswith(f"{path}."))
         return sorted({int(rest) for rest in rests if rest.isascii() and rest.isdecimal()})
 
@@ -349,13 +349,13 @@ class _Plan:
                 length, at = counted(data, at)
                 at += length
                 if at > len(data) or (cdr and length and data[at - 1]):
-                    raise Misfit(f"the string {path!r} has no end")
+                    raise MalformedMessage(f"the string {path!r} has no end")
             return at
 
         return step
 
     def _sequence(self, path: str, leaf: _Leaf) -> Step:
-        """Return the step over an array of numbers whose length stands in the message."""
+        """Return the step over an array of numbers whose length is in the message."""
         picks = []
         for index in self._indices(path):
             self.leaves[f"{path}.{index}"] = leaf
@@ -367,7 +367,7 @@ class _Plan:
             if cdr and count:
                 at += -(at - 4) % leaf.align
             if at + count * leaf.size > len(data):
-                raise Misfit(f"the array {path!r} has no end")
+                raise MalformedMessage(f"the array {path!r} has no end")
             if count < least:
                 raise ShortArray(path, count)
             for index, number in picks:
@@ -384,7 +384,7 @@ class _Plan:
             run = self._fields(kind, prefix, above, steps, [])
             return _in_turn([*steps, *self._run(run)])
 
-        skip = element("\0")  # a path that nobody asks for
+        skip = element("\0")  # a path that no column has
         picks = {index: element(f"{path}.{index}.") for index in self._indices(path) if count < 0 or index < count}
         counted, least = self._counted, 1 + max(picks, default=-1)
 
@@ -393,7 +393,7 @@ class _Plan:
             if count < 0:
                 elements, at = counted(data, at)
             if elements > len(data):
-                raise Misfit(f"the array {path!r} has no end")
+                raise MalformedMessage(f"the array {path!r} has no end")
             if elements < least:
                 raise ShortArray(path, elements)
             for index in range(elements):
@@ -416,7 +416,7 @@ def _in_turn(steps: Sequence[Step]) -> Step:
 
 
 def ros_channel(topic: str, kind: str, types: Callable[[], Types], serialisation: Serialisation, where: str) -> Channel:
-    """Return a channel of ROS messages; `types` is asked only when they are read."""
+    """Return a channel of ROS messages; `types` is called only when they are read."""
 
     def fields() -> tuple[str, ...]:
         return numeric_fields(types(), kind, where)

@@ -1,7 +1,7 @@
 """Recordings whose messages are topics: ROS bags and MCAP files, read in one pass into compact columns.
 
-A container yields the bytes of one message after another; the message's type says where in them the wanted numbers
-are. Only those are kept, packed side by side, so a recording of any size opens in the memory of its wanted columns.
+A container yields the bytes of one message after another; the type of the message gives the positions of the wanted
+numbers in them. Only these are kept, packed side by side, so a recording needs no more memory than its wanted columns.
 """
 
 from __future__ import annotations
@@ -18,35 +18,37 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError
 from ..state import TimeArray
-from .recording import Held, Messages, Recording, Wanted, not_held
+from .recording import Messages, Recording, TopicInfo, Wanted, not_found
 
 NS = 1_000_000_000
+"""Nanoseconds per second."""
+"""Nanoseconds per second."""
 
 
-class Misfit(Exception):  # noqa: N818  (a finding about one message, and no error of its own)
-    """The bytes of a message are not what its type says."""
+class MalformedMessage(Exception):  # noqa: N818  (about one message; reading goes on)
+    """The bytes of a message do not fit its type."""
 
 
 class ShortArray(Exception):  # noqa: N818  (the same)
-    """An array of a message ends before the index that is asked for."""
+    """An array of a message is shorter than the wanted index."""
 
     def __init__(self, path: str, length: int) -> None:
         super().__init__(f"{path!r} has {length} elements")
 
 
 class Extractor(Protocol):
-    """Takes the wanted numbers out of the bytes of messages of one type."""
+    """Extracts the wanted numbers from the bytes of messages of one type."""
 
     @property
     def codes(self) -> Sequence[str]:
-        """Return the types of the numbers, as `struct` has them."""
+        """Return the types of the numbers, as codes of `struct`."""
         ...
 
     def __call__(self, data: bytes) -> Sequence[Any]:
         """Return the numbers.
 
         Raises:
-            Misfit, ShortArray, struct.error: the message does not hold them.
+            MalformedMessage, ShortArray, struct.error: the message does not contain them.
         """
         ...
 
@@ -62,7 +64,7 @@ class Channel:
     Attributes:
         kind: the name of their type.
         fields: lists the numeric fields; of an array, its first element.
-        extractor: from wanted columns to what takes them out of a message; `not_held`'s error for an unknown one.
+        extractor: from wanted columns to their extractor; raises the error of `not_found` for an unknown column.
     """
 
     topic: str
@@ -76,15 +78,15 @@ Message = tuple[Channel, tuple[int, ...], bytes]
 
 
 @dataclass
-class Found:
-    """What a pass over a recording has come upon so far, besides messages."""
+class ScanResult:
+    """The channels and notes that a pass over a recording has found so far."""
 
     channels: list[Channel] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
 class Rows:
-    """Rows of numbers, packed side by side in bytes that grow; no object is kept for a row."""
+    """Rows of numbers, packed in one growing array of bytes, without an object per row."""
 
     def __init__(self, codes: Sequence[str]) -> None:
         self._codes = list(codes)
@@ -95,7 +97,7 @@ class Rows:
         return len(self._bytes) // self._struct.size
 
     def append(self, values: Sequence[Any]) -> None:
-        """Append a row; an integer column that meets a float becomes one of floats."""
+        """Append a row; an integer column becomes one of floats when a float is appended."""
         try:
             self._bytes += self._struct.pack(*values)
         except struct.error:
@@ -120,27 +122,27 @@ class Rows:
 
 
 class TopicRecording(Recording):
-    """A recording of topics; subclasses say how its messages come out of its files."""
+    """A recording of topics; subclasses read the messages from the files."""
 
     stamps: ClassVar[tuple[str, ...]] = ("log_time",)
-    """Columns that the container adds to every message: int64 ns. The first orders the rows."""
+    """Columns that the container adds to every message: int64 ns. Rows are sorted by the first."""
 
     @abstractmethod
-    def messages(self, folder: Path, topics: Collection[str] | None, found: Found) -> Iterator[Message]:
-        """Yield the messages of these topics (of all where None) in the order of the file; fill `found` on the way.
+    def messages(self, folder: Path, topics: Collection[str] | None, found: ScanResult) -> Iterator[Message]:
+        """Yield the messages of these topics (None: of all) in the order of the file; also fill `found`.
 
         Raises:
             DatasetError: not a recording of this format, or nothing whole in it.
         """
 
     def read(self, folder: Path, wanted: Sequence[Wanted]) -> Messages:
-        """Read the topics asked for; see `Recording.read`."""
+        """Read the wanted topics; see `Recording.read`."""
         where = str(self.path(folder))
         for want in wanted:
             if want.sender is not None:
                 raise DatasetError(f"{where}: {want.message}: topics have no `entity`; leave it out")
         tables = {want.message: _Table(want, where, self.stamps) for want in wanted}
-        found = Found()
+        found = ScanResult()
         for channel, stamps, data in self.messages(folder, tables.keys(), found):
             tables[channel.topic].add(channel, stamps, data)
         notes = list(found.notes)
@@ -149,25 +151,25 @@ class TopicRecording(Recording):
                 known = {channel.topic for channel in found.channels}
                 if name in known:
                     raise DatasetError(f"{where}: no message of {name} in the recording")
-                raise not_held(where, "topic", name, known)
+                raise not_found(where, "topic", name, known)
             notes += table.notes()
         return Messages([tables[want.message].columns() for want in wanted], tuple(notes))
 
-    def contents(self, folder: Path) -> list[Held]:
-        """Return the topics that the recording holds."""
-        found = Found()
+    def contents(self, folder: Path) -> list[TopicInfo]:
+        """Return the topics of the recording."""
+        found = ScanResult()
         spans: dict[str, tuple[Channel, int, int, int]] = {}
         for channel, stamps, _ in self.messages(folder, None, found):
             _, count, first, last = spans.get(channel.topic, (channel, 0, stamps[0], stamps[0]))
             spans[channel.topic] = channel, count + 1, min(first, stamps[0]), max(last, stamps[0])
         return [
-            Held(topic, channel.kind, count, (last - first) / NS, _fields(channel))
+            TopicInfo(topic, channel.kind, count, (last - first) / NS, _fields(channel))
             for topic, (channel, count, first, last) in sorted(spans.items())
         ]
 
 
 def _fields(channel: Channel) -> tuple[str, ...]:
-    """Return the numeric fields of a topic; none where its type is not defined, which is an error only when read."""
+    """Return the numeric fields of a topic; empty if its type is not defined, which is an error only when read."""
     try:
         return channel.fields()
     except DatasetError:
@@ -175,14 +177,14 @@ def _fields(channel: Channel) -> tuple[str, ...]:
 
 
 class _Table:
-    """What is wanted of one topic, and the rows found so far."""
+    """The wanted columns of one topic, and the rows read so far."""
 
     def __init__(self, want: Wanted, where: str, stamps: tuple[str, ...]) -> None:
         self.want, self.where, self.stamps = want, f"{where}: {want.message}", stamps
         self.fields = [column for column in want.columns if column not in stamps]
         self.channels: dict[Channel, Extractor] = {}
         self.rows: Rows | None = None
-        self.misfits, self.first_misfit = 0, ""
+        self.malformed, self.first_malformed = 0, ""
 
     def add(self, channel: Channel, stamps: tuple[int, ...], data: bytes) -> None:
         extract = self.channels.get(channel) or self._opened(channel)
@@ -191,11 +193,11 @@ class _Table:
         try:
             rows.append((*stamps, *extract(data)))
         except ShortArray as error:
-            row = len(rows) + self.misfits
-            raise DatasetError(f"{self.where}: message {row}: {error}, and more are asked for") from None
-        except (Misfit, struct.error, RecursionError) as error:
-            self.first_misfit = self.first_misfit or f"message {len(rows)}: {error}"
-            self.misfits += 1
+            row = len(rows) + self.malformed
+            raise DatasetError(f"{self.where}: message {row}: {error}, and a later one is wanted") from None
+        except (MalformedMessage, struct.error, RecursionError) as error:
+            self.first_malformed = self.first_malformed or f"message {len(rows)}: {error}"
+            self.malformed += 1
 
     def _opened(self, channel: Channel) -> Extractor:
         extract = channel.extractor(self.fields)
@@ -209,22 +211,22 @@ class _Table:
         return extract
 
     def notes(self) -> list[str]:
-        """Return what was passed over.
+        """Return what was skipped.
 
         Raises:
             DatasetError: most messages do not fit their type.
         """
-        if not self.misfits:
+        if not self.malformed:
             return []
         assert self.rows is not None
         kind = next(iter(self.channels)).kind
-        if self.misfits > len(self.rows):
-            count = self.misfits + len(self.rows)
+        if self.malformed > len(self.rows):
+            count = self.malformed + len(self.rows)
             raise DatasetError(
-                f"{self.where}: {self.misfits} of {count} messages are not what {kind or 'their type'} is defined as, "
-                f"the first is {self.first_misfit}; is the definition that of the recording?"
+                f"{self.where}: {self.malformed} of {count} messages are not what {kind or 'their type'} is defined "
+                f"as, the first is {self.first_malformed}; is the definition that of the recording?"
             )
-        return [f"{self.want.message}: {self.misfits} damaged messages passed over, the first is {self.first_misfit}"]
+        return [f"{self.want.message}: {self.malformed} damaged messages skipped, the first is {self.first_malformed}"]
 
     def columns(self) -> Mapping[str, NDArray[Any]]:
         """Return the wanted columns, in the order of the container's first stamp."""
@@ -240,5 +242,5 @@ class _Table:
 
 
 def _signed(values: NDArray[Any]) -> TimeArray:
-    """Return int64 where the values fit; a stamp beyond it is no time, and is told as one further on."""
+    """Return int64 if the values fit; larger stamps are invalid times, and are reported later on."""
     return values.astype(np.int64) if values.max(initial=0) < 2**63 else values

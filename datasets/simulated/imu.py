@@ -16,7 +16,7 @@ from .scenario import Scenario
 
 
 def sample_imu(scenario: Scenario, seed: int, motion: Motion, edges_ns: TimeArray, biases: Array) -> ImuStream:
-    """Return the IMU's samples: means of the motion, plus bias and white noise, marred by its faults.
+    """Return the IMU's samples: means of the motion, plus bias and white noise, with the IMU's faults.
 
     Args:
         scenario: what is simulated.

@@ -8,12 +8,15 @@ from ..quantities import DEGREE
 from ..rig import ImuNoise
 
 DEGREE_PER_HOUR = DEGREE / 3600
+"""rad/s."""
 DEGREE_PER_ROOT_HOUR = DEGREE / 60
+"""rad/√s, which is rad/s/√Hz."""
 MILLI_G = 9.81e-3
+"""m/s²."""
 
 WALK_HORIZON_S = 1000.0
-"""Data sheets give an in-run bias stability B, and no walk. Ours is the random walk whose Allan deviation, K √(τ/3),
-has reached B at this τ."""
+"""Data sheets state an in-run bias stability B and no random walk. We take the random walk K whose Allan deviation,
+K √(τ/3), equals B at this τ."""
 
 
 def from_data_sheet(

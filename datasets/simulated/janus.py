@@ -1,4 +1,4 @@
-"""A four-beam Janus DVL: which of its beams have bottom lock, and the velocity that those give."""
+"""A four-beam Janus DVL: bottom lock of each beam, and the velocity from the locked ones."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def janus_beams(beam_angle_rad: float) -> Array:
 def read_dvl(
     scenario: Scenario, spec: DvlSpec, dvl: Mounting, motion: Motion, t_s: Array, seed: int
 ) -> tuple[Array, Array, Array]:
-    """Return v_WD_D (n, 3) where there is bottom lock and NaN elsewhere, its error (n, 3), and its sigma (n, 3).
+    """Return v_WD_D (n, 3), NaN without bottom lock, its error (n, 3), and its sigma (n, 3).
 
     The velocity is the least-squares solution of its beams, and its sigma their figure of merit: the square roots of
-    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors of which
-    each two are correlated by ±1/2; a reading has no place for that: its sigmas are right, axis by axis, and no more.
+    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors that are
+    correlated by ±1/2 in pairs. A reading has no correlations, so its sigmas are right axis by axis only.
     """
     R_WB, p_WB_W, v_WB_W = motion.pose(t_s)
     v_WD_B = np.einsum("nji,nj->ni", R_WB, v_WB_W)

@@ -1,9 +1,8 @@
 """Missions: smooth paths whose positions, velocities, accelerations and rates are known exactly.
 
-A mission is drawn on a coarse grid, from straight legs, arcs, dives and climbs, smoothed and rocked a little; quintic
-splines are laid through the drawn velocity and Euler angles. From there on the splines are the truth: position is
-their exact antiderivative, acceleration and angular acceleration their exact derivatives, and nothing is integrated
-numerically.
+A mission is drawn on a coarse grid from straight legs, arcs, dives and climbs, smoothed, and given a small wobble.
+Quintic splines interpolate the drawn velocity and Euler angles, and these splines are the truth: position is their
+exact antiderivative, acceleration and angular acceleration their exact derivatives. Nothing is integrated numerically.
 """
 
 from __future__ import annotations
@@ -27,11 +26,13 @@ if TYPE_CHECKING:
     from .scenario import Scenario
 
 KNOT_S = 0.1
+"""Spacing of the splines' knots: a fifteenth of the smoothing, so that they follow the drawn path closely."""
 SMOOTHING_S = 1.5
 """Standard deviation of the Gaussian that rounds every corner of the path."""
 MARGIN_S = 12.0
-"""How far the splines reach beyond both ends, so that their ends and the smoothing's stay out of the mission."""
+"""By this the splines extend beyond both ends, which keeps the ends of splines and smoothing out of the mission."""
 WOBBLE_PERIODS_S = (4.3, 6.1, 9.7, 15.1)
+"""Usual periods of a small vehicle's roll, pitch and control; no two have a common multiple within minutes."""
 SPEED_WOBBLE = 0.03
 """Relative variation of the speed."""
 
@@ -40,7 +41,7 @@ def fly(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Motion
     """Return the motion of a scenario's mission; a recorded one follows `path`, or the scenario's file.
 
     Raises:
-        DatasetError: a recorded mission has no path, or one that no vehicle can follow; or another mission has one.
+        DatasetError: a recorded mission without a path, or with one that no vehicle can follow; or a path for another.
     """
     if scenario.mission == RECORDED:
         return follow(scenario, path)
@@ -76,14 +77,14 @@ def draw(scenario: Scenario, rng: np.random.Generator, sea: Sea | None = None) -
 
 
 def lean(slope: Array, psi: Array) -> Array:
-    """Return by which angles (n, 3) a body leans that lies on a slope (n, 2) with its nose towards psi (n,)."""
+    """Return the angles (n, 3) by which a body on a slope (n, 2) leans, with its nose towards psi (n,)."""
     ahead = slope[:, 0] * np.cos(psi) + slope[:, 1] * np.sin(psi)
     left = -slope[:, 0] * np.sin(psi) + slope[:, 1] * np.cos(psi)
     return np.stack([np.arctan(left), -np.arctan(ahead), np.zeros(len(psi))], axis=1)
 
 
 def depth_profile(scenario: Scenario, plan: Plan, t_s: Array) -> Array:
-    """Return depths (n,) m below where the vehicle floats: straight dives and climbs, before smoothing.
+    """Return depths (n,) m below the floating position: straight dives and climbs, before smoothing.
 
     Surfacings are centred on multiples of one period, which divides the mission evenly, and on both its ends.
     """

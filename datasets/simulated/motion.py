@@ -1,4 +1,4 @@
-"""A vehicle's motion as splines, exact in every derivative: what every simulated sensor reads."""
+"""A vehicle's motion as splines, exact in every derivative; every simulated sensor reads it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Motion:
         velocity: its derivative, v_WB_W, m/s.
         angles: spline of (phi, theta, psi), rad, with R_WB = Rz(psi) Ry(theta) Rx(phi); in a forward-left-up body a
             raised nose has theta < 0.
-        notes: how it was made, where a mission's name does not say it.
+        notes: how it was made, if the mission's name does not say.
     """
 
     position: BSpline
@@ -45,7 +45,7 @@ class Motion:
 
     @classmethod
     def from_velocity(cls, t_s: Array, v_WB_W: Array, angles: Array, p_0: Array) -> Motion:
-        """Lay quintic splines through v_WB_W and the angles, (n, 3), at times t_s (n,); position p_0 is at time 0."""
+        """Interpolate v_WB_W and the angles, (n, 3), at t_s (n,) by quintic splines; p_0 is the position at time 0."""
         velocity = make_interp_spline(t_s, v_WB_W, k=5)
         position = velocity.antiderivative()
         # a B-spline's basis sums to one: shifting every coefficient shifts the curve

@@ -1,4 +1,4 @@
-"""Random streams: every cause of randomness has one of its own."""
+"""Random streams: one for each cause of randomness."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ RANDOM_STREAMS = {
     "dvl_beams": 27,
     "waves": 28,
 }
-"""Apart, so that dropping one changes no other. Never renumber."""
+"""Separate, so that dropping one changes no other. Never renumber: a seed would give another log."""
 
 
 def random_stream(seed: int, cause: str) -> np.random.Generator:

@@ -19,24 +19,28 @@ if TYPE_CHECKING:
     from .scenario import Scenario
 
 DEGREE_OF_SPLINES = 5
+"""Quintic, as in `missions`: accelerations and angular accelerations are then smooth."""
+"""Quintic, as in `missions`: accelerations and angular accelerations are then smooth."""
 STEEPEST_DEG = 80.0
-"""Beyond this pitch the Euler angles that the splines run through turn too fast."""
+"""Beyond this pitch the Euler angles change too fast for the splines."""
 TURN_LIMIT_DEG = 90.0
-"""Between neighbouring poses; beyond it nobody knows which way the vehicle turned."""
+"""Between neighbouring poses; beyond it the direction of the turn is ambiguous."""
 ACCELERATION_LIMIT_M_S2 = 50.0
+"""5 g: no underwater vehicle reaches it, and a jump of 10 cm between poses at 20 Hz does."""
 RATE_LIMIT_RAD_S = 10.0
+"""570 °/s: faster than any underwater vehicle turns."""
 CHECK_S = 0.01
+"""Spacing of the times at which these limits are checked, the period of a 100 Hz IMU."""
 
 
 def follow(scenario: Scenario, path: Trajectory | None = None) -> Motion:
     """Return the motion along `path`, or along the scenario's file; the log begins path_start_s after its first pose.
 
-    Without path_spacing_s the splines run through every pose; with it they are the closest, in least squares, among
-    the splines with knots that far apart. A path with the noise of its recording needs the second: at 100 Hz one
-    centimetre of noise is an acceleration of 100 m/s².
+    Without path_spacing_s the splines interpolate every pose. With it they are the least-squares fit among the splines
+    with knots that far apart. Noisy poses need a fit: at 100 Hz one centimetre of noise is an acceleration of 100 m/s².
 
     Raises:
-        DatasetError: no path, a file that cannot be read, or poses that no smooth path runs through; names the row.
+        DatasetError: no path, a file that cannot be read, or poses that no smooth path passes; names the row.
     """
     source, digest = "path", ""
     if path is None:
@@ -125,7 +129,7 @@ def _columns(spline: BSpline, columns: slice) -> BSpline:
 
 
 def _check_motion(source: str, motion: Motion, scenario: Scenario) -> None:
-    """Refuse what no vehicle does: it is the poses' noise, or a jump between them."""
+    """Refuse accelerations and rates beyond any vehicle's: they are noise of the poses, or a jump between them."""
     t_s = np.arange(*scenario.reach_s, CHECK_S)
     for what, values, limit, unit in (
         ("an acceleration", motion.acceleration(t_s), ACCELERATION_LIMIT_M_S2, "m/s²"),

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
@@ -57,6 +57,12 @@ def _of_this_noise(imu: Any) -> Any:
     return {"noise": imu} if isinstance(imu, str | ImuNoise) else imu
 
 
+if TYPE_CHECKING:
+    Imu = Any  # an ImuSpec, which may be made from its noise alone
+else:
+    Imu = Annotated[ImuSpec, BeforeValidator(_of_this_noise)]
+
+
 @dataclass(frozen=True, config=STRICT)
 class Scenario:
     """A mission, a vehicle and its sensors.
@@ -68,7 +74,7 @@ class Scenario:
 
     mission: str = "lawnmower"  # a name in MISSIONS, or "recorded"
     duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
-    imu: Annotated[ImuSpec, BeforeValidator(_of_this_noise)] = ImuSpec()  # or its noise alone: "tactical"
+    imu: Imu = ImuSpec()  # or its noise alone: "tactical"
 
     # the path
     speed_m_s: Positive = 1.5

@@ -1,8 +1,8 @@
-"""The sea's surface: waves and tide, by which a vehicle is moved and its depth sensor misled.
+"""The sea's surface: waves and tide, which move a vehicle and bias its depth sensor.
 
-Waves are linear (Airy) and long-crested, in deep water, of a Bretschneider spectrum. A water particle at height z moves
-on a circle that shrinks as e^kz, and so does a vehicle, which also leans with the surfaces of equal pressure. Its
-pressure sensor moves with those surfaces and hardly sees the waves: the height it reads is z − rise_m.
+Waves are linear (Airy) and long-crested, in deep water, with a Bretschneider spectrum. A water particle at height z
+moves on a circle whose radius falls as e^kz. The vehicle moves likewise, and leans with the surfaces of equal pressure.
+Its pressure sensor moves with those surfaces and hardly sees the waves: the height it reads is z − rise_m.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from .scenario import Scenario
 
 COMPONENTS = 16
+"""Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
+"""Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,7 @@ class Sea:
         return cls(amplitude, frequency, phase, direction, gravity, scenario.tide)
 
     def rise_m(self, t_s: Array, p_W: Array) -> Array:
-        """Return how far the surface of equal pressure through each point p_W (n, 3) has risen, (n,) m.
+        """Return the rise of the surface of equal pressure through each point p_W (n, 3), (n,) m.
 
         ζ = tide + Σ a e^kz cos(k · x − ω t + φ); at z = 0 it is the sea's own surface.
         """
@@ -69,7 +71,7 @@ class Sea:
         return self.tide_m(t_s) + np.sum(height * np.cos(phase), axis=1)
 
     def displacement(self, t_s: Array, p_W: Array) -> Array:
-        """Return how far the water is, (n, 3) m, from where it would be in a flat sea, p_W (n, 3)."""
+        """Return the displacement of the water, (n, 3) m, from its position p_W (n, 3) in a flat sea."""
         height, phase, _ = self._waves(t_s, p_W)
         along = -np.sum(height * np.sin(phase), axis=1)
         return np.column_stack([along[:, None] * self.direction, self.rise_m(t_s, p_W)])
@@ -80,7 +82,7 @@ class Sea:
         return -np.sum(wavenumber * height * np.sin(phase), axis=1)[:, None] * self.direction
 
     def tide_m(self, t_s: Array) -> Array:
-        """Return how far the tide has risen since the start, (n,)."""
+        """Return the rise of the tide since the start, (n,) m."""
         if self.tide is None:
             return np.zeros(len(t_s))
         phase = self.tide.phase_deg * DEGREE

@@ -1,4 +1,4 @@
-"""The seabed under a mission: how far down it is, and how far along a beam."""
+"""The seabed under a mission: its depth, and its range along a beam."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from ..state import Array
 STEEPEST = 0.2
 """Slope; up to it, `ranges` converges for every beam that points within 75° of straight down."""
 ITERATIONS = 60
+"""Of `ranges`, whose error falls at least by 0.75 in each (STEEPEST times tan 75°): 1e-7 of the first guess's."""
+"""Of `ranges`, whose error falls at least by 0.75 in each (STEEPEST times tan 75°): 2e-8 of the first."""
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -36,6 +36,7 @@ for tilt."""
 HEADING_FLOOR_RAD = np.radians(1.0)
 """No heading sensor is believed beyond this: its errors do not average out over a window."""
 UNKNOWN_HEADING_RAD = np.pi / np.sqrt(3)
+"""Standard deviation of a heading that is equally likely in every direction."""
 SLIP_RAD = 0.05
 """A vehicle whose sideways velocity is not measured goes this far off its nose."""
 UNKNOWN_SPEED_M_S, FASTEST_M_S = 1.5, 30.0
@@ -43,6 +44,7 @@ UNKNOWN_SPEED_M_S, FASTEST_M_S = 1.5, 30.0
 ORIGIN_SIGMA_M = 0.5
 """How well the vehicle's place at the start of the log is W's origin."""
 UNKNOWN_DEPTH_M = 5.0
+"""Sigma of the depth at the start without a depth sensor: a log begins near the surface."""
 NEWEST = 3
 """So many readings are waited for; depth's errors stay for longer, and the median of so many counts as one."""
 OUTLIER_SIGMAS, OUTLIER_M_S = 6.0, 0.3
@@ -55,8 +57,10 @@ SPEED, GRAVITY, ACCEL, GYRO = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12
 YAW, PLACE, WAY = 12, slice(13, 16), slice(16, 19)
 UNKNOWNS = 19
 ITERATIONS = 4
+"""Times that the rows of heading, position and height are linearised anew."""
 EACH = np.eye(UNKNOWNS)
 LEVI_CIVITA = skew(np.eye(3)).transpose(1, 0, 2) * -1.0
+"""ε_ijk, (3, 3, 3)."""
 
 
 @dataclass

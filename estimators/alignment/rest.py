@@ -17,13 +17,17 @@ from .window import heard
 SCATTER = 1.7
 """Samples may scatter by this much more than the rig's noise; their means over BLOCK_S by SCATTER_OF_MEANS more."""
 SCATTER_OF_MEANS = 3.0
+"""The same for means over BLOCK_S, of which low-frequency noise is a larger part."""
 BLOCK_S = 0.5
+"""s: vibration averages out over it."""
 REST_M_S = 0.01
 """At rest a vehicle sways by this much, and a sensor's mean is off by this much more than its noise explains."""
 REST_RAD_S = 1e-3
+"""The same in rotation: 0.06 °/s."""
 VOUCHES_M_S = 0.2
 """A velocity known no better than this does not tell rest from way."""
 SIGMAS = 3.5
+"""Normal noise exceeds it once in 2,000."""
 
 
 def rest_s(log: Log, start_ns: int, longest_s: float, step_s: float = 1.0) -> float:

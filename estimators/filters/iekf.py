@@ -1,5 +1,7 @@
 """The right-invariant extended Kalman filter with biases ("imperfect": biases stand beside the group).
 
+The equations are docs/conventions.md (39) to (43).
+
 Pose and velocity X = (R_WB, v_WB_W, p_WB_W) are one element of SE_2(3), and the error is on its left, in W:
 
     X_true = Exp(xi) X        xi = (phi, rho, nu), rotation, position, velocity; biases are added, as ever

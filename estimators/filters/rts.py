@@ -1,4 +1,4 @@
-"""Rauch–Tung–Striebel: the error-state Kalman filter forwards, then backwards over the whole log.
+"""Rauch–Tung–Striebel: the error-state Kalman filter forwards, then backwards; docs/conventions.md (44).
 
 Source: Rauch, Tung & Striebel 1965, doi:10.2514/3.3166, on the manifold. With x_k the filtered state of epoch k, P_k
 its covariance, x⁻ = f(x_k) and P⁻ = F P_k Fᵀ + Q the prediction of epoch k + 1, and S for what is smoothed:
@@ -34,6 +34,7 @@ from .eskf import ErrorStateKalman
 from .filter_pass import FilterOptions, FilterPass
 
 TRIANGLE = DIM * (DIM + 1) // 2
+"""Numbers in one half of a symmetric matrix."""
 PAGE = 1024
 """Epochs for which memory is taken at a time."""
 

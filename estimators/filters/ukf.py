@@ -1,4 +1,4 @@
-"""The unscented Kalman filter on the manifold, with filterpy's sigma points and unscented transform.
+"""The unscented Kalman filter on the manifold, with filterpy's sigma points; docs/conventions.md (38).
 
 Sigma points are errors about the state that stands beside them, x ⊕ e. After each transform the mean error moves that
 state, and the covariance is turned into its new tangent as after any update (`state.inject`). The block of `imu` is

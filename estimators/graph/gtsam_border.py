@@ -1,7 +1,7 @@
 """The border with GTSAM: keys, tangents, and our physics as its factors.
 
 GTSAM's pose tangent is (rotation, translation in B) and its bias stands in B axes, since it is fed with samples in B.
-Everything is converted here and nowhere else.
+Everything is converted here and nowhere else; docs/conventions.md (46) to (48).
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ OF_PLACE, OF_GYRO = np.int64(3), np.int64(3)
 """Where the translation begins in GTSAM's pose tangent, and the gyro in its bias."""
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
+"""For factors that do not depend on velocity or bias."""
 LEAST_WALK = 1e-4
 """1/s: a bias must walk for GTSAM; by this much of the white noise nobody notices."""
 INTEGRATION_DENSITY = 1e-5
@@ -309,7 +310,7 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
 
 @stage("linearisation")
 def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.CustomFactor:
-    """Return the loose preintegrated-DVL factor (eq. 6) between two keyframes."""
+    """Return the loose preintegrated-DVL factor between two keyframes; docs/conventions.md (6)."""
 
     @stage("linearisation")
     def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:

@@ -1,5 +1,7 @@
 """The IMU block: from samples to a motion with its covariance, once, for every estimator.
 
+The equations are docs/conventions.md (21) to (34).
+
 An IMU at the lever arm l = p_BI_B senses its own point I. The block integrates I's motion from raw samples, with coning
 and sculling corrections, and moves it to B at the two ends:
 

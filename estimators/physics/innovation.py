@@ -1,4 +1,4 @@
-"""Innovations: what a reading says against the belief from before it, and whether that belief owned up to it (NIS)."""
+"""Innovations: a reading against the belief before it, and their normalised square, NIS; docs/conventions.md (37)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
 """The two steps of the error-state Kalman filter, compiled: for the filters, and for smoothers between keyframes.
 
+The equations are docs/conventions.md (26), (32), (33), (35) and (36).
+
 Source: Solà 2017, arXiv:1711.02298, sections 5–6, with the error on the right of R_WB and the block of `imu` as the
 transition.
 """

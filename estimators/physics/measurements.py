@@ -1,7 +1,7 @@
 """What each sensor says of the state: one residual and one Jacobian per sensor, for every estimator.
 
 Every residual is h(x) ⊖ z, and H is its derivative by the error state (15) of `datasets.state`, exactly of what is
-filled in. Numbers in brackets are the equations of DESIGN, section 3.
+filled in.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from .state import GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0
 
 @inner
 def position_residual(R_WB: Array, p_WB_W: Array, p_BS_B: Array, p_WS_W: Array, r: Array, H: Array) -> None:
-    """r(x) = p_WB_W + R_WB p_BS_B − p_WS_W                                         [eq. 2]
+    """r(x) = p_WB_W + R_WB p_BS_B − p_WS_W                                         [docs/conventions.md (2)]
 
     For a sensor S at a lever arm: a GPS antenna. Fills r (3,) m and H (3, 15).
     """
@@ -53,7 +53,7 @@ def position_residual(R_WB: Array, p_WB_W: Array, p_BS_B: Array, p_WS_W: Array, 
 
 @inner
 def depth_residual(R_WB: Array, p_WB_W: Array, p_BP_B: Array, z_m: float, r: Array, H: Array) -> None:
-    """r(x) = (p_WB_W + R_WB p_BP_B) · e_z − z_m                                    [eq. 1]
+    """r(x) = (p_WB_W + R_WB p_BP_B) · e_z − z_m                                    [docs/conventions.md (1)]
 
     Fills row 0 of r, m, and of H: the last one of `position_residual`.
     """
@@ -68,7 +68,7 @@ def depth_residual(R_WB: Array, p_WB_W: Array, p_BP_B: Array, z_m: float, r: Arr
 
 @inner
 def attitude_residual(R_WB: Array, R_BH: Array, R_WH: Array, r: Array, H: Array) -> None:
-    """r(x) = Log((R_WH R_BH⁻¹)⁻¹ R_WB)                                             [eq. 3]
+    """r(x) = Log((R_WH R_BH⁻¹)⁻¹ R_WB)                                             [docs/conventions.md (3)]
 
     For a sensor that gives a full attitude R_WH (9,), by rows. Fills r (3,) rad, in B, and H (3, 15).
     """
@@ -85,7 +85,7 @@ def attitude_residual(R_WB: Array, R_BH: Array, R_WH: Array, r: Array, H: Array)
 
 @inner
 def yaw_residual(R_WB: Array, R_BH: Array, yaw_rad: float, r: Array, H: Array) -> None:
-    """r(x) = yaw(R_WB R_BH) − yaw_rad, wrapped                                     [the heading-only form of eq. 3]
+    """r(x) = yaw(R_WB R_BH) − yaw_rad, wrapped                                     [docs/conventions.md (15)]
 
     By the heading sensor's own rotation its derivative is (0, sin φ / cos θ, cos φ / cos θ), with φ, θ its roll and
     pitch. Within 2° of its x axis being vertical a yaw says nothing: r and H are zero there. Fills row 0 of r, rad, and
@@ -105,7 +105,7 @@ def yaw_residual(R_WB: Array, R_BH: Array, yaw_rad: float, r: Array, H: Array) -
 
 @inner
 def dvl_residual(R_WB: Array, v_WB_W: Array, v_WB_B: Array, r: Array, H: Array) -> None:
-    """r(x) = R_WBᵀ v_WB_W − v_WB_B                                                 [eq. 4]
+    """r(x) = R_WBᵀ v_WB_W − v_WB_B                                                 [docs/conventions.md (4)]
 
     Fills r (3,) m/s and H (3, 15).
     """
@@ -122,7 +122,7 @@ def dvl_residual(R_WB: Array, v_WB_W: Array, v_WB_B: Array, r: Array, H: Array) 
 
 @compiled
 def preintegrated_dvl_residual(R_i: Array, p_i: Array, p_j: Array, dp_ij: Array, H_i: Array, H_j: Array) -> Array:
-    """r(x_i, x_j) = R_iᵀ (p_j − p_i) − Δp̃_ij                                       [eq. 6]
+    """r(x_i, x_j) = R_iᵀ (p_j − p_i) − Δp̃_ij                                       [docs/conventions.md (6)]
 
     Returns r (3,) m and fills H_i and H_j, both (3, 15).
     """
@@ -156,7 +156,7 @@ def tight_dvl_residual(
 ) -> Array:
     """r(x_i, b_i, x_j) = r_p − K r_R: the displacement's residual, less what the rotation's says of it.
 
-        r_p = R_iᵀ (p_j − p_i) − Δp̃(b_g)         r_R = Log(R_iᵀ R_j ΔR̃(b_g)ᵀ)         [eq. 6, given the rotation]
+        r_p = R_iᵀ (p_j − p_i) − Δp̃(b_g)         r_R = Log(R_iᵀ R_j ΔR̃(b_g)ᵀ)         [docs/conventions.md (20)]
 
     Args:
         R_i, p_i, b_g: pose and gyro bias of keyframe i.

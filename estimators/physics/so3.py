@@ -1,4 +1,4 @@
-"""Rotations: skew, exponential, logarithm and Jacobians of SO(3), compiled.
+"""Rotations: skew, exponential, logarithm and Jacobians of SO(3), compiled; docs/conventions.md (11) to (14).
 
 Source: Solà, Deray & Atchuthan 2018, arXiv:1812.01537, appendix B. Where an angle is small, coefficients come from
 their series.

@@ -1,5 +1,7 @@
 """The state in compiled code: its record, ⊕ and ⊖, and how a covariance follows its state into a new tangent.
 
+The equations are docs/conventions.md (7) to (9).
+
 A STATE record is a `NavState` with the covariance P of its error. Compiled code is given an array of length 1, for a
 record taken out of an array does not keep it alive. What a record holds is handed on as a view, `s.P[:]`: without the
 colon its type would be another, and the function compiled once more.

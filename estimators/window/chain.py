@@ -1,4 +1,4 @@
-"""Gauss–Newton's normal equations on a chain of keyframes, in which each is tied to its neighbours only.
+"""Gauss–Newton's normal equations on a chain of keyframes, each tied to its neighbours; docs/conventions.md (45).
 
 docs/window.md derives them; equation numbers are those of that page. They are block-tridiagonal, 15 × 15, and are
 eliminated in the covariance form, in which nothing cancels:

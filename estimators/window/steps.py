@@ -30,6 +30,7 @@ from .factors import distance, linearise_factor, linearise_prior, linearise_tie
 NO_ROOM = -1
 """What `extend` answers where keyframes, factors or samples might find no room; nothing is done then."""
 SOLVED, NOT_POSITIVE, NOT_FINITE = range(3)
+"""What a solve answers."""
 CAUSES = {
     NOT_POSITIVE: "an innovation's or a predicted state's covariance is not positive",
     NOT_FINITE: "the newest position is not finite",

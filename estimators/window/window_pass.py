@@ -32,6 +32,7 @@ from .factors import FACTOR, LOOSE, TIGHT
 from .steps import CAUSES, MOST_ITERATIONS, NO_ROOM, NOT_POSITIVE, SOLVED, WINDOW, count_outliers
 
 WORDS = IMU_SAMPLE.itemsize // 8
+"""Numbers of eight bytes in an IMU sample."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
+from driver import run_log
 from fathom.datasets import Log
 from fathom.datasets.epochs import cut
 from fathom.datasets.log import ImuStream
@@ -81,7 +81,7 @@ def test_a_gap_costs_the_same_however_often_one_looks(log: Log, name: str) -> No
     alone = replace(with_gap(log, 10.0, 10.8), dvl=None, depth=None, gps=None, heading=None)
     sigma = []
     for period_s in (5.0, 0.1):
-        online = run_log(alone, create(name), score_period_s=period_s).online
+        online = run_log(alone, create(name), period_s=period_s).online
         row = int(np.flatnonzero(online.t_ns == log.start_ns + 15_000_000_000)[0])
         sigma.append(np.sqrt(np.diag(online.P[row])))
     assert sigma[1] == pytest.approx(sigma[0], rel=0.1)  # a long sample and ten short ones: T³/4 against T³/3

@@ -2,33 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from fathom.datasets import Log
-from fathom.datasets.described.opening import RecordingNotFound, open_log
+from fathom.datasets.described.opening import open_log
 from fathom.estimators.alignment.initialise import initialise
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-
-def opened(name: str, data: Path) -> Log:
-    try:
-        return open_log(name, data)
-    except RecordingNotFound as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="module")
-def ictineu(recorded_data: Path) -> Log:
-    return opened("ictineu_stpere_2004", recorded_data)
-
-
-@pytest.fixture(scope="module")
-def lauv(recorded_data: Path) -> Log:
-    return opened("lauv_noptilus2_2015", recorded_data)
 
 
 def dead_reckoned(log: Log) -> tuple[Array, Array]:

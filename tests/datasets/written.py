@@ -5,18 +5,23 @@ from __future__ import annotations
 import json
 import random
 import shutil
+import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 import yaml
-from fathom.datasets import Log
+from fathom.datasets import DatasetError, Log
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from fathom.datasets.described.opening import open_log
 from fathom.datasets.log import ImuStream
+from hypothesis import HealthCheck, settings
 
 READING = "std_msgs/Header header\nfloat64[] z\nfloat64[] sigma\n"
 """A reading of any aiding sensor, with its sigma, so that what is written is what is read."""
@@ -297,6 +302,34 @@ WRITERS: dict[str, Callable[[Log, Path], Path]] = {
     "mcap-json": lambda log, folder: write_mcap(log, folder, "json"),
 }
 """Every format that holds a log bit for bit: a float64 stays one, and so does a nanosecond."""
+
+
+FUZZ = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
+)
+"""Damage of any kind, the same at every run."""
+LONGEST_S = 20.0
+"""No damage may keep a reader busier than this."""
+
+
+def log_or_error(folder: Path, *, repair: bool = False) -> None:
+    """Damage is an error or a log, nothing else, and soon."""
+    start = perf_counter()
+    with suppress(DatasetError):
+        assert isinstance(open_log(folder, repair=repair), Log)
+    assert perf_counter() - start < LONGEST_S
+
+
+@contextmanager
+def allocated() -> Iterator[Callable[[], int]]:
+    """The peak of what Python allocates meanwhile, bytes; asked for afterwards."""
+    peak = 0
+    tracemalloc.start()
+    try:
+        yield lambda: peak
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
 
 
 def copied(source: Path, target: Path) -> Path:

@@ -1,6 +1,6 @@
 """A smooth motion of a body, known in closed form, and what its sensors would read: the oracle of the physics tests.
 
-Nothing here uses the code under test: velocities and accelerations are central differences of the sensor's own path.
+The motion uses none of the code under test: velocities and accelerations are central differences of the sensor's path.
 """
 
 from __future__ import annotations
@@ -8,8 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from fathom.datasets import ImuNoise, Mounting, NavState, Rig
+from fathom.datasets import Belief, ImuNoise, Mounting, NavState, Rig
 from fathom.datasets.epochs import IMU_SAMPLE, READING
+from fathom.estimators import FACTORS
+from fathom.estimators.physics.imu import compile_rig
+from fathom.estimators.physics.measurements import measure
+from fathom.estimators.physics.state import as_record
 from scipy.spatial.transform import Rotation
 
 NOISE = ImuNoise(4e-5, 1e-3, 1e-6, 3e-5, 5e-5, 7e-3)
@@ -97,3 +101,13 @@ def reading(kind: int, z: np.ndarray, sigma: np.ndarray, t_ns: int = 0) -> np.nd
     row["kind"], row["t_ns"], row["received_ns"], row["sigma"] = kind, t_ns, t_ns, np.inf
     row["z"][0, : np.size(z)], row["sigma"][0, : np.size(sigma)] = np.ravel(z), sigma
     return row
+
+
+def residual(
+    row: np.ndarray, state: NavState, rig: Rig, inflate: dict[str, float] | None = None
+) -> tuple[np.ndarray, ...]:
+    """What a reading's own code says: r, its Jacobian (·, 15) and the covariance of its noise."""
+    r, H, C = np.zeros(3), np.zeros((3, 15)), np.zeros((3, 3))
+    record = as_record(Belief(0, state, np.zeros((15, 15))))
+    n = measure(row, 0, record, compile_rig(rig, FACTORS, inflate or {}), r, H, C)
+    return r[:n].copy(), H[:n].copy(), C[:n, :n].copy()

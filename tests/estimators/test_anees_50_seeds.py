@@ -13,8 +13,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
-from fathom.bench.metrics import BLOCKS, associate, error_state
+from driver import BLOCKS, error_states, run_log
 from fathom.datasets import Log
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
@@ -51,9 +50,8 @@ def test_anees_over_50_seeds_lies_in_its_interval(name: str, path: str) -> None:
         result = run_log(log, estimator)
         assert result.status == "done", (seed, result.cause)
         for output, track in result.outputs.items():
-            truth, track = associate(log.truth, track)
             rows = np.searchsorted(track.t_ns, log.start_ns + EPOCHS_S * 10**9)
-            errors.setdefault(output, []).append(error_state(truth, track)[rows])
+            errors.setdefault(output, []).append(error_states(log.truth, track)[rows])
             covariances.setdefault(output, []).append(track.P[rows])
     assert list(errors) == (["online", "smoothed"] if name in ("rts", "fls", "batch") else ["online"])
     for output in errors:

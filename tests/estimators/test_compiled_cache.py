@@ -58,6 +58,7 @@ def run(folder: Path, **environment: str) -> tuple[float, int, Path, str]:
     return float(value), int(hits), Path(path), done.stderr
 
 
+@pytest.mark.slow
 def test_a_changed_callee_never_runs_as_old_machine_code(tmp_path: Path) -> None:
     cache = str(tmp_path / "cache")
     called = copy_of_the_package(tmp_path)
@@ -67,6 +68,7 @@ def test_a_changed_callee_never_runs_as_old_machine_code(tmp_path: Path) -> None
     assert run(tmp_path, NUMBA_CACHE_DIR=cache)[:2] == (10.0, 0)
 
 
+@pytest.mark.slow
 def test_a_second_clone_and_a_changed_comment_compile_nothing(tmp_path: Path) -> None:
     cache = str(tmp_path / "cache")
     copy_of_the_package(tmp_path / "first")
@@ -76,6 +78,7 @@ def test_a_second_clone_and_a_changed_comment_compile_nothing(tmp_path: Path) ->
     assert run(tmp_path / "second", NUMBA_CACHE_DIR=cache)[1] == 1
 
 
+@pytest.mark.slow
 def test_where_no_folder_can_be_written_a_temporary_one_is_used_and_said(tmp_path: Path) -> None:
     copy_of_the_package(tmp_path)
     blocked = tmp_path / "blocked"

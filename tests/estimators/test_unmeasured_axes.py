@@ -10,10 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log, score_ticks
-from fathom.bench.execution.result import Result, innovation_dof
-from fathom.bench.metrics.floor import floors_along
-from fathom.datasets import Log, Scenario, simulate
+from driver import Driven, run_log
 from fathom.datasets.epochs import DVL, IMU_SAMPLE, READING, Epoch
 from fathom.datasets.state import VELOCITY
 from fathom.estimators import create
@@ -22,7 +19,7 @@ from fathom.estimators.graph.gtsam_border import carried_factor, reading_factor
 from fathom.estimators.graph.losses import rows
 from fathom.estimators.physics.imu import BLOCK, compile_rig
 from fathom.estimators.physics.state import as_record
-from scipy.stats import chi2
+from logs import full, unmeasured
 
 FLEET: dict[str, tuple[str, dict[str, Any]]] = {
     "eskf": ("eskf", {}),
@@ -57,32 +54,9 @@ def cases(labels: Collection[str], twice: Collection[str] = FILTERS) -> list[tup
 
 
 @cache
-def full() -> Log:
-    return simulate(Scenario(duration_s=20), seed=5)
-
-
-@cache
-def unmeasured(pattern: str, sigma: float = np.inf, z: float | None = 0.0) -> Log:
-    """A short log, whose DVL is a wheel ("wheel"), or has one reading in three of all axes ("by rows").
-
-    What is not measured reads z (random numbers around it where it is not zero; as it was where it is None).
-    """
-    log = full()
-    assert log.dvl is not None
-    out = np.zeros(log.dvl.z.shape, np.bool_)
-    out[:, 1:] = True
-    if pattern == "by rows":
-        out[::3] = False
-    z_all, sigmas = log.dvl.z.copy(), np.where(out, sigma, log.dvl.sigma)
-    if z is not None:
-        z_all[out] = z * np.random.default_rng(1).normal(size=out.sum())
-    return replace(log, dvl=replace(log.dvl, z=z_all, sigma=sigmas))
-
-
-@cache
-def said(label: str, pattern: str, sigma: float = np.inf, z: float | None = 0.0) -> Result:
+def said(label: str, pattern: str, sigma: float = np.inf, z: float | None = 0.0) -> Driven:
     name, options = EVERY[label]
-    result = run_log(unmeasured(pattern, sigma, z), create(name, **options), score_period_s=2.0)
+    result = run_log(unmeasured(pattern, sigma, z), create(name, **options), period_s=2.0)
     assert result.status == "done", result.cause
     return result
 
@@ -133,7 +107,7 @@ def test_the_axes_that_are_left_out_are_known_less(label):
     """Sideways and vertically the wheel says nothing; along it says what the DVL did."""
     sigma = {}
     name, options = FLEET[label]
-    every = run_log(full(), create(name, **options), score_period_s=2.0)
+    every = run_log(full(), create(name, **options), period_s=2.0)
     for result in (every, said(label, "wheel")):
         online = result.online
         cov_B = np.einsum("nji,njk,nkl->nil", online.R_WB, online.P[:, VELOCITY, VELOCITY], online.R_WB)
@@ -160,18 +134,6 @@ def test_dead_reckoning_goes_where_its_nose_says(label):
     v_B = np.einsum("nji,nj->ni", online.R_WB, online.v_WB_W)
     np.testing.assert_allclose(v_B[:, 1:], 0, atol=1e-12)
     assert v_B[:, 0].min() > 1.0
-
-
-@pytest.mark.parametrize("label", ["eskf", "ukf", "fls"])
-def test_nis_counts_the_axes_that_are_measured(label):
-    name, options = FLEET[label]
-    for pattern in PATTERNS:
-        log = unmeasured(pattern)
-        result = run_log(log, create(name, **options), nis=True)
-        assert innovation_dof(result)["dvl"] == np.isfinite(log.dvl.sigma).sum()
-        nis = result.nis[result.nis["kind"] == DVL]
-        low, high = chi2.interval(0.9999, nis["dof"].sum())
-        assert low < nis["nis"].sum() < high
 
 
 @pytest.mark.parametrize("name", ["eskf", "eskf-filterpy", "iekf", "ukf"])
@@ -204,19 +166,6 @@ def test_a_loss_is_as_wide_as_the_axes_that_are_measured(carried):
         factor = carried_factor(0, reading, block, as_record(log.prior), rig)
     assert isinstance(factor, gtsam.CustomFactor)
     assert rows(factor) == 1
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
-def test_the_floor_leaves_the_same_axes_out(pattern):
-    ticks = score_ticks(full(), 4.0)
-    every, none, poor = (
-        floors_along(log, ticks, (0.0, 3.0)) for log in (full(), unmeasured(pattern), unmeasured(pattern, 1e6, None))
-    )
-    for ahead in (0.0, 3.0):
-        of_every, of_none, of_poor = (np.einsum("nii->ni", f[ahead].P) for f in (every, none, poor))
-        np.testing.assert_allclose(of_none, of_poor, rtol=1e-6)
-        assert (of_none >= of_every * (1 - 1e-9)).all()
-        assert (of_none[-1, 6:8] > 1.05 * of_every[-1, 6:8]).any()
 
 
 @pytest.mark.parametrize("without", [(), ("heading",)])

@@ -1,1 +1,1 @@
-"""What is looked at between streams: clocks, mountings, lever arms, references."""
+"""Checks of two sensors that see the same motion: clocks, mountings, scales, lever arms, references."""

@@ -1,4 +1,4 @@
-"""One story of all clocks: every delay met between two streams, weighed together, against the IMU."""
+"""The clocks: one least-squares fit of all delays measured between two streams, relative to the IMU."""
 
 from __future__ import annotations
 
@@ -11,29 +11,32 @@ from scipy.stats import chi2
 
 from ....datasets.log import Log
 from ..findings.finding import Check, Finding
-from .answers import Delay
 from .fitting import FALSE_ALARM, Estimate
 from .inertial import seconds
+from .pair_check import Delay
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DELAY_MATTERS_S = 0.05
+"""At 2 m/s a reading this late is 0.1 m off, as much as a good fix."""
 TRUTH_DELAY_MATTERS_S = 0.1
+"""The same for a truth: its delay enters scores and no estimate, and its source is often 5 to 10 Hz."""
 WELL_KNOWN_S = 0.2
+"""Three sigmas within this: such delays take part in the vote on whether it is the IMU's clock that is off."""
 FLOOR_S = 0.005
-"""No delay is believed beyond this: half a sample of a fast IMU."""
+"""Added to the sigma of each delay: half a sample of a 100 Hz IMU."""
 PARTS = ("truth position", "truth velocity", "truth attitude")
 
 
 @dataclass(frozen=True)
-class Story:
-    """How late (s) each stream's stamps are by the IMU's clock, and whether the delays agree on it.
+class ClockFit:
+    """By how much (s) the stamps of each stream are late on the IMU's clock, and whether the delays agree.
 
     Attributes:
-        late: by stream, those that a chain of delays ties to the IMU.
-        agrees: whether what is left over is chance; delays up to `DELAY_MATTERS_S` are let pass.
-        worst: the delay that fits worst.
+        late: by stream, for the streams that a chain of delays connects to the IMU.
+        agrees: whether the residuals are within chance; the first `DELAY_MATTERS_S` of a residual is ignored.
+        worst: the delay with the largest residual; None if they agree.
     """
 
     late: dict[str, Estimate]
@@ -41,15 +44,15 @@ class Story:
     worst: Delay | None
 
 
-def weigh(delays: Sequence[Delay]) -> Story:
-    """Return the least-squares lateness of every stream that is tied to the IMU."""
+def fit_clocks(delays: Sequence[Delay]) -> ClockFit:
+    """Return the least-squares lateness of every stream that is connected to the IMU."""
     tied = {"imu"}
     while grown := {s for d in delays if {d.late, d.than} & tied for s in (d.late, d.than)} - tied:
         tied |= grown
     used = [d for d in delays if d.late in tied]
     names = sorted(tied - {"imu"})
     if not names:
-        return Story({}, True, None)
+        return ClockFit({}, True, None)
     A = np.zeros((len(used), len(names)))
     for row, d in enumerate(used):
         for name, sign in ((d.late, 1.0), (d.than, -1.0)):
@@ -65,12 +68,12 @@ def weigh(delays: Sequence[Delay]) -> Story:
     excess = np.maximum(np.abs(left) - DELAY_MATTERS_S, 0.0) / sigma
     agrees = loops == 0 or float(np.sum(excess**2)) < chi2.isf(FALSE_ALARM, loops)
     found = {n: Estimate(float(late[i]), float(np.sqrt(cov[i, i])), dof) for i, n in enumerate(names)}
-    return Story(found, bool(agrees), used[int(np.argmax(excess))] if not agrees else None)
+    return ClockFit(found, bool(agrees), used[int(np.argmax(excess))] if not agrees else None)
 
 
 def clock_check(log: Log, delays: Sequence[Delay]) -> Check:
-    """Weigh the delays, and say whose clock is wrong and by how much."""
-    story = weigh(delays)
+    """Fit all delays, and report which clock is off and by how much."""
+    story = fit_clocks(delays)
     facts = {f"{name} later than the IMU by": late.text("s") for name, late in story.late.items()}
     facts |= _overlaps(log)
     findings = []
@@ -79,21 +82,21 @@ def clock_check(log: Log, delays: Sequence[Delay]) -> Check:
     known = {n for n, e in sensors.items() if e.known_to(WELL_KNOWN_S)}
     common = _common(sensors) if len(known) > 1 and known <= set(off) else None
     if common is not None:
-        says = (
-            f"Every other stream is {_late(common)} by the IMU's clock, and they agree among themselves: it is the "
-            "IMU's clock that is wrong."
+        message = (
+            f"Every other stream is {_late(common)} by the IMU's clock, and the others agree with each other: the "
+            "IMU's clock is wrong."
         )
-        findings.append(Finding("imu", says, mend("imu", common.times(-1))))
+        findings.append(Finding("imu", message, fix("imu", common.times(-1))))
     else:
         findings += [_finding(name, off[name]) for name in off if name not in PARTS]
         findings += _truth_findings(log, {n: e for n, e in story.late.items() if n in PARTS}, set(off))
     if story.worst is not None and not findings:
         worst = story.worst
-        says = (
+        message = (
             f"The delays do not fit one clock per stream: {worst.late} is later than {worst.than} by "
             f"{worst.by.text('s')}, which the others contradict."
         )
-        findings.append(Finding(worst.late.split()[0], says))
+        findings.append(Finding(worst.late.split()[0], message))
 
     def draw(axes: Axes) -> None:
         for row, d in enumerate(delays):
@@ -110,7 +113,7 @@ def _matters(name: str) -> float:
 
 
 def _common(late: dict[str, Estimate]) -> Estimate | None:
-    """Return the lateness that all share; None where they differ."""
+    """Return the mean lateness if all streams share it; else None."""
     weight = np.array([1 / np.hypot(e.sigma, FLOOR_S) ** 2 for e in late.values()])
     value = np.array([e.value for e in late.values()])
     mean = float(np.sum(weight * value) / np.sum(weight))
@@ -122,8 +125,8 @@ def _late(by: Estimate) -> str:
     return f"{Estimate(abs(by.value), by.sigma).text('s')} {'late' if by.value > 0 else 'early'}"
 
 
-def mend(stream: str, late: Estimate) -> str:
-    """Return what brings a stream onto the IMU's clock."""
+def fix(stream: str, late: Estimate) -> str:
+    """Return the key that brings a stream onto the IMU's clock."""
     path = "truth" if stream == "truth" else f"streams.{stream}"
     if late.value > 0 and stream not in ("imu", "truth"):
         return f"{path}.time.delay_s: {late.value:.3f}"
@@ -131,10 +134,10 @@ def mend(stream: str, late: Estimate) -> str:
 
 
 def _finding(name: str, late: Estimate) -> Finding:
-    says = f"The stamps of {name} are {_late(late)} by the IMU's clock."
+    message = f"The stamps of {name} are {_late(late)} by the IMU's clock."
     if late.value > 0:
-        says += f" Where `time.received` is a column: `time.clock_offset_s: {-late.value:.3f}`."
-    return Finding(name, says, mend(name, late))
+        message += f" Where `time.received` is a column: `time.clock_offset_s: {-late.value:.3f}`."
+    return Finding(name, message, fix(name, late))
 
 
 def _truth_findings(log: Log, parts: dict[str, Estimate], off: set[str]) -> list[Finding]:
@@ -143,13 +146,13 @@ def _truth_findings(log: Log, parts: dict[str, Estimate], off: set[str]) -> list
     whose = log.truth_kind
     common = _common(parts)
     if common is not None:
-        return [Finding("truth", f"The {whose} is {_late(common)} by the IMU's clock.", mend("truth", common))]
+        return [Finding("truth", f"The {whose} is {_late(common)} by the IMU's clock.", fix("truth", common))]
     listed = ", ".join(f"{name.split()[1]} {_late(late)}" for name, late in parts.items())
-    return [Finding("truth", f"The {whose} is not of one time by the IMU's clock: {listed}.")]
+    return [Finding("truth", f"The parts of the {whose} have different delays by the IMU's clock: {listed}.")]
 
 
 def _overlaps(log: Log) -> dict[str, str]:
-    """Return how much of the IMU's time each stream covers, where that is not all."""
+    """Return the time that each stream covers, for those that do not cover all of the IMU's."""
     said = {}
     end = seconds(log, log.imu.t_ns[-1:])[0]
     spans = {name: seconds(log, stream.t_ns) for name, stream in log.streams.items() if len(stream)}

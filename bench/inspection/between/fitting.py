@@ -1,7 +1,8 @@
-"""Least squares whose uncertainty the data tell: what is left over is coloured, and nobody knows its colour.
+"""Least squares with an uncertainty taken from the data, valid under unknown correlation of the residuals.
 
-A log is cut into `BLOCKS` stretches. Leaving them out one at a time shows how far each estimate leans on any of them
-(the delete-one-block jackknife), whatever the correlation inside a stretch; few stretches are answered by Student's t.
+A log is cut into `BLOCKS` blocks. The spread of the estimates with one block left out gives the covariance (the
+delete-one-block jackknife), under arbitrary correlation inside a block. Because the blocks are few, intervals use
+Student's t.
 Source: Cameron & Miller 2015, A practitioner's guide to cluster-robust inference, section VI (CR3).
 """
 
@@ -17,9 +18,11 @@ from scipy.stats import t as student
 from ....datasets.state import Array
 
 BLOCKS = 12
+"""Enough for 11 degrees of freedom, few enough that errors of one block hardly reach into the next."""
 FALSE_ALARM = 1e-3
 """How often one estimate may seem to differ by chance."""
 FEWEST_BLOCKS = 4
+"""With data in fewer blocks the t quantile is over 31, and no estimate would say anything."""
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 Plane = NDArray[np.complexfloating[Any, Any]]
@@ -37,41 +40,41 @@ class Estimate:
 
     @property
     def reach(self) -> float:
-        """How far from the value the truth may lie, at `FALSE_ALARM`."""
+        """Half width of the interval that holds the truth with probability 1 − `FALSE_ALARM`."""
         return float(student.isf(FALSE_ALARM / 2, max(self.dof, 1)) * self.sigma)
 
     def differs(self, nominal: float, at_least: float) -> bool:
-        """Whether it differs from `nominal` by more than chance explains, and by a size that matters."""
+        """Whether it differs from `nominal` by more than chance, and by more than `at_least`."""
         return abs(self.value - nominal) > max(self.reach, at_least)
 
     def known_to(self, size: float) -> bool:
-        """Whether the data fix it that well: three sigmas within `size`."""
+        """Whether three sigmas are within `size`."""
         return bool(np.isfinite(self.sigma) and 3 * self.sigma < size)
 
     def times(self, factor: float) -> Estimate:
-        """Return it in another unit."""
+        """Return the estimate in another unit."""
         return Estimate(self.value * factor, self.sigma * abs(factor), self.dof)
 
     def text(self, unit: str = "") -> str:
-        """Return "value ± sigma unit", digits as far as sigma has two."""
+        """Return "value ± sigma unit", with two digits of sigma."""
         if not np.isfinite(self.sigma):
             return "not observable"
         digits = 3 if self.sigma <= 0 else int(np.clip(1 - np.floor(np.log10(self.sigma)), 0, 6))
         return f"{self.value:.{digits}f} ± {self.sigma:.{digits}f}{' ' * bool(unit)}{unit}"
 
     def text_if(self, size: float, unit: str = "") -> str:
-        """Return its text, or that the data do not fix it to `size`."""
+        """Return `text`, or "not observable here" if it is not known to `size`."""
         return self.text(unit) if self.known_to(size) else f"not observable here (sigma {self.sigma:.2g} {unit})"
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Coefficients by name, their covariance, and what is left over.
+    """Coefficients by name, their covariance, and the residuals.
 
     Attributes:
         names: of the k coefficients.
         value, cov: (k,) and (k, k).
-        dof: stretches that held data, less one.
+        dof: blocks that held data, less one.
         residual: (n,), of every row.
         kept: (n,) rows that were not outliers.
     """
@@ -89,20 +92,20 @@ class Fit:
 
     @property
     def rms(self) -> float:
-        """Of the rows kept."""
+        """Root mean square of the residuals of the rows kept."""
         return float(np.sqrt(np.mean(self.residual[self.kept] ** 2)))
 
 
 def least_squares(columns: dict[str, Array], y: Array, block: Index) -> Fit | None:
-    """Fit y (n,) by the columns (n,) each, twice passing over rows beyond six robust sigmas.
+    """Fit y (n,) by the columns (n,), three times; after each fit rows beyond six robust sigmas are left out.
 
     Args:
         columns: by the name of their coefficient.
         y: (n,).
-        block: (n,) which stretch a row belongs to, from 0.
+        block: (n,) the block that a row belongs to, from 0.
 
     Returns:
-        None where fewer than `FEWEST_BLOCKS` stretches hold data, or the columns are not finite, or there are none.
+        None if fewer than `FEWEST_BLOCKS` blocks hold data, if a value is not finite, or if there are no columns.
     """
     if not columns:
         return None
@@ -123,7 +126,7 @@ def least_squares(columns: dict[str, Array], y: Array, block: Index) -> Fit | No
 
 
 def _jackknife(X: Array, y: Array, block: Index) -> tuple[Array, Array]:
-    """Return coefficients and covariance, no variance smaller than white noise of the residual's size would give."""
+    """Return coefficients and covariance; each variance is at least that of white noise of the residual's size."""
     size = np.sqrt((X**2).sum(axis=0))
     empty = size == 0
     size[empty] = 1.0
@@ -148,18 +151,18 @@ def _jackknife(X: Array, y: Array, block: Index) -> tuple[Array, Array]:
 
 
 def mean_of(y: Array, block: Index) -> Estimate | None:
-    """Return the mean of y (n,) over its stretches."""
+    """Return the mean of y (n,), with its sigma from the blocks."""
     fit = least_squares({"mean": np.ones(len(y))}, y, block)
     return None if fit is None else fit["mean"]
 
 
 def blocks_of(count: int) -> Index:
-    """Return stretches of equally many rows."""
+    """Return the block of each of `count` rows: blocks of equally many rows."""
     return np.arange(count) * BLOCKS // max(count, 1)
 
 
 def windows_of(t_s: Array, length_s: float, gap_s: float) -> Index:
-    """Return windows (n,) of about `length_s`, none of which spans a gap, numbered in order."""
+    """Return the window (n,) of each row: windows of about `length_s`, numbered in order, none across a gap."""
     if not len(t_s):
         return np.zeros(0, np.intp)
     piece = np.cumsum(np.diff(t_s, prepend=t_s[0]) > gap_s)
@@ -169,7 +172,7 @@ def windows_of(t_s: Array, length_s: float, gap_s: float) -> Index:
 
 
 def blocks_of_windows(window: Index) -> Index:
-    """Return stretches made of whole windows, of about equally many rows."""
+    """Return the block of each row: blocks made of whole windows, of about equally many rows."""
     first = np.searchsorted(window, np.arange(window[-1] + 1 if len(window) else 0))
     return blocks_of(len(window))[first][window]
 

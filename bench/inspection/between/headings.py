@@ -1,4 +1,4 @@
-"""The heading sensor against the gyro, and against the truth: signs, units, bias, delay, offset, disturbance."""
+"""Heading sensor against gyro, and against truth: signs, units, bias, delay, offset, magnetic disturbance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from scipy.ndimage import uniform_filter1d
 from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from .answers import Answer, Delay
 from .fitting import (
     BLOCKS,
     Estimate,
@@ -26,23 +25,32 @@ from .fitting import (
     without_trend,
 )
 from .inertial import LEVEL_S, Inertial, headings, seconds
+from .pair_check import Delay, PairCheck
 from .path_fit import fit_path, positions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DEGREE = np.pi / 180
+"""rad."""
 WINDOW_S = 60.0
+"""A mean is removed per window: a consumer gyro's bias drifts by under 0.1° in it, and a turn still fits."""
 LAGS_S = np.arange(-3.0, 3.01, 0.25)
+"""s: where the search for the delay starts; steps shorter than a turn, so that the fit converges from the best one."""
 SLOPE_MATTERS = 0.03
+"""Relative: 1° of error in a turn of 33°, more than compass deviation that is left after calibration."""
 FOLLOWS = 0.7
-"""Least length of the mean of e^{i error}: 1 for none, 0 for errors all around."""
+"""Least length of the mean of e^{i error}; it is 1 without errors and 0 for errors in all directions."""
 OFFSET_MATTERS = 1.0 * DEGREE
+"""A magnetic compass is good to 1 to 2°; 1° is 1.7 % of the distance travelled, across the track."""
 SLOW_MATTERS = 0.5 * DEGREE
+"""Slow errors below this are within the rounding of many compasses."""
 OVERCONFIDENT = 2.0
-"""A sigma that claims the errors to be so many times smaller than they are, is a finding."""
+"""A stated sigma smaller by this factor than one that accounts for lasting errors is a finding."""
 MOST_ROWS = 20_000
+"""Readings used; a longer stream is thinned, since slow errors do not average out anyway."""
 GRID_ROWS = 3_000
+"""Readings used on the coarse grid of delays, for speed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +97,7 @@ def fit_gyro_to_heading(log: Log, imu: Inertial) -> GyroHeading | None:
         if apart > 3 * np.hypot(sigma_s, short[0]["delay"].sigma):
             sigma_s = float(
                 np.hypot(sigma_s, apart)
-            )  # slow and fast turns differ: a filter's lag, or a disturbed compass
+            )  # slow and fast turns give different delays: a filter's lag, or a disturbed compass
     left = psi - slope.value * np.interp(t_s - delay_s, imu.t_s, theta) + bias.value * t_s
     delay = Estimate(delay_s, sigma_s, slope.dof)
     return GyroHeading(t_s, psi, slope, bias, delay, left - np.median(left), best.kept)
@@ -98,7 +106,7 @@ def fit_gyro_to_heading(log: Log, imu: Inertial) -> GyroHeading | None:
 def _turns(
     t_s: Array, psi: Array, imu: Inertial, theta: Array, window_s: float, degree: int, delay_s: float | None
 ) -> tuple[Fit, float] | None:
-    """Return the fit of the heading by the turned gyro, and the delay (s), from a coarse grid where none is given."""
+    """Return the fit of the heading by the integrated gyro, and the delay (s); the search starts on a coarse grid."""
     if delay_s is None and len(t_s) > 2 * GRID_ROWS:
         stride = len(t_s) // GRID_ROWS
         coarse = _turns(t_s[::stride], psi[::stride], imu, theta, window_s, degree, None)
@@ -136,8 +144,8 @@ def _turns(
     return None if best is None else (best, delay_s)
 
 
-def gyro_against_heading(log: Log, imu: Inertial) -> Answer | None:
-    """Whether the gyro turns as the heading does, and how the two disagree."""
+def gyro_against_heading(log: Log, imu: Inertial) -> PairCheck | None:
+    """Compare the integrated gyro with the heading."""
     found = fit_gyro_to_heading(log, imu)
     if found is None:
         return None
@@ -156,12 +164,12 @@ def gyro_against_heading(log: Log, imu: Inertial) -> Answer | None:
             findings.append(
                 Finding(
                     "imu",
-                    f"The gyro reads {found.bias.text('rad/s')} about the vertical while the heading stays; the stated "
-                    f"gyro_bias_sigma, {stated:.2g} rad/s, makes that next to impossible.",
+                    f"The gyro reads {found.bias.text('rad/s')} about the vertical while the heading is constant; that "
+                    f"is over four times the stated gyro_bias_sigma, {stated:.2g} rad/s.",
                     f"streams.imu.noise.gyro_bias_sigma: {1.2 * abs(found.bias.value):.2g}",
                 )
             )
-    spread = _spread_by_time(log, imu, found) if turning and abs(found.slope.value - 1) < 0.3 else None
+    spread = _error_growth(log, imu, found) if turning and abs(found.slope.value - 1) < 0.3 else None
     if spread is not None:
         facts["heading less gyro, rms by time apart"] = ", ".join(
             f"{np.degrees(np.sqrt(max(v, 0))):.2g}° in {lag:.3g} s" for lag, v in spread.shown
@@ -175,11 +183,11 @@ def gyro_against_heading(log: Log, imu: Inertial) -> Answer | None:
         level = 1.5 * np.quantile(np.abs(np.degrees(found.left)), 0.99) + 0.1
         axes.set_ylim(-level, level)
 
-    return Answer(Check("gyro against heading", facts, tuple(findings), draw), delays)
+    return PairCheck(Check("gyro against heading", facts, tuple(findings), draw), delays)
 
 
 def _turning_axis(log: Log, found: GyroHeading) -> tuple[str, float]:
-    """Return which axis of B, as the description has it, turns with the heading, and its correlation."""
+    """Return the axis of B, as described, whose rate correlates most with the heading's, and the correlation."""
     t_s = seconds(log, log.imu.t_ns)
     dt_s = np.diff(t_s, prepend=t_s[0] - log.imu.period_ns * 1e-9)
     turned = np.cumsum(log.imu.w_WI_I @ np.asarray(log.rig.imu.R_BS).T * dt_s[:, None], axis=0)
@@ -199,40 +207,41 @@ def _turning_axis(log: Log, found: GyroHeading) -> tuple[str, float]:
 def _slope_findings(log: Log, imu: Inertial, found: GyroHeading, correlation: float) -> list[Finding]:
     slope, size = found.slope, abs(found.slope.value)
     if np.ptp(found.psi) < 2.05 * np.pi * DEGREE and np.ptp(imu.turned()) > 1.0:
-        says = (
-            f"The heading stays within {np.degrees(np.ptp(found.psi)):.1f}° while the gyro turns: radians as degrees."
+        message = (
+            f"The heading stays within {np.degrees(np.ptp(found.psi)):.1f}° while the gyro turns: radians are read as "
+            "degrees."
         )
-        return [Finding("heading", says, "streams.heading.heading.unit: rad")]
+        return [Finding("heading", message, "streams.heading.heading.unit: rad")]
     for ratio, gyro, heading in ((DEGREE, "deg/s", "rad"), (1 / DEGREE, "rad/s", "deg")):
         if abs(size / ratio - 1) < 0.3 and slope.known_to(0.3 * ratio):
-            says = (
+            message = (
                 f"The heading turns {slope.text()} times as far as the gyro, which is the ratio of degrees and "
-                "radians: a unit is wrong, the gyro's, or else the heading's "
+                "radians: the unit of the gyro is wrong, or that of the heading "
                 f"(`streams.heading.heading.unit: {heading}`)."
             )
-            return [Finding("imu", says, f"streams.imu.gyro.unit: {gyro}")]
+            return [Finding("imu", message, f"streams.imu.gyro.unit: {gyro}")]
     if not slope.differs(1.0, SLOPE_MATTERS) or abs(correlation) < 0.5:
         return []
     right = _gyro_is_right(log, imu)
     if slope.value < 0:
-        says = f"The heading turns against the gyro (slope {slope.text()}): "
+        message = f"The heading turns against the gyro (slope {slope.text()}): "
         if right is False:
             up = int(np.argmax(np.abs(np.asarray(log.rig.imu.R_BS)[2])))
             scale = ", ".join("-1" if i == up else "1" for i in range(3))
-            says += "the gyro is mirrored, for the positions follow the heading."
-            return [Finding("imu", says, f"streams.imu.gyro.scale: [{scale}]")]
-        says += "a compass is read as a yaw, or a yaw as a compass"
-        says += "." if right else "; or the gyro is mirrored."
-        return [Finding("heading", says, "streams.heading.convention: yaw  # or compass, whichever it is not")]
-    says = f"The heading turns {slope.text()} times as far as the gyro: "
+            message += "the gyro's sign is wrong, since the positions follow the heading."
+            return [Finding("imu", message, f"streams.imu.gyro.scale: [{scale}]")]
+        message += "a compass is read as a yaw, or a yaw as a compass"
+        message += "." if right else "; or the gyro's sign is wrong."
+        return [Finding("heading", message, "streams.heading.convention: yaw  # or compass, whichever it is not")]
+    message = f"The heading turns {slope.text()} times as far as the gyro: "
     if right is False:
-        return [Finding("imu", says + "the gyro's scale is off.", f"streams.imu.gyro.scale: {slope.value:.4g}")]
-    says += "the compass deviates with the heading" + ("." if right else ", or else the gyro's scale is off.")
-    return [Finding("heading", says)]
+        return [Finding("imu", message + "the gyro's scale is off.", f"streams.imu.gyro.scale: {slope.value:.4g}")]
+    message += "the compass deviates with the heading" + ("." if right else ", or else the gyro's scale is off.")
+    return [Finding("heading", message)]
 
 
 def _gyro_is_right(log: Log, imu: Inertial) -> bool | None:
-    """Whether a third witness takes the gyro's side against the heading: the truth's attitude, else positions."""
+    """Whether the truth's attitude, or else the positions, agree with the gyro rather than with the heading."""
     yaw = _truth_yaw(log)
     if yaw is not None:
         fit = _turns(*yaw, imu, imu.turned(), (yaw[0][-1] - yaw[0][0]) / BLOCKS, 0, 0.0)
@@ -273,7 +282,7 @@ def _axis_findings(log: Log, axis: str, correlation: float, imu: Inertial) -> li
 
 
 def mounting_text(R_BS: Array, p_BS_B: Array | None) -> str:
-    """Return a mounting as log.yaml has it: three angles, and a lever arm where one is given."""
+    """Return a mounting in the form of log.yaml: three angles, and a lever arm if one is given."""
     pitch = np.arcsin(np.clip(-R_BS[2, 0], -1, 1))
     roll, yaw = np.arctan2(R_BS[2, 1], R_BS[2, 2]), np.arctan2(R_BS[1, 0], R_BS[0, 0])
     names = zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees([roll, pitch, yaw]), strict=True)
@@ -284,14 +293,14 @@ def mounting_text(R_BS: Array, p_BS_B: Array | None) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
-    """Half the mean square of the difference that heading errors have after some time: by time, and what it says.
+class ErrorGrowth:
+    """How heading errors decorrelate: half the mean square of the difference of two errors, by their time apart.
 
     Attributes:
         shown: pairs (s, rad²).
-        white, slow: variances, rad².
-        correlation_s: how long the slow part stays.
-        growth: how much the variance grows from neighbours to its height, rad².
+        white, slow: variances of the two parts, rad².
+        correlation_s: correlation time of the slow part.
+        growth: from neighbouring readings to the maximum, rad².
     """
 
     shown: list[tuple[float, float]]
@@ -300,10 +309,10 @@ class Spread:
     correlation_s: float
     growth: Estimate
     tilt: float
-    """Of the growth, what a level that leans in turns may be to blame for, rad²."""
+    """The part of the growth that a tilted level in turns may cause, rad²."""
 
     def findings(self, log: Log, found: GyroHeading) -> list[Finding]:
-        """Return whether the stated sigma forgets that errors last."""
+        """Return a finding if the stated sigma neglects that errors last."""
         assert log.heading is not None
         if not self.growth.differs(0.0, SLOW_MATTERS**2 + self.tilt):
             return []
@@ -318,19 +327,19 @@ class Spread:
             Finding(
                 "heading",
                 f"The heading's errors last: {np.degrees(np.sqrt(self.slow)):.1f}° of them stay for about "
-                f"{self.correlation_s:.2g} s (a disturbed compass), while {np.degrees(stated):.2g}° is stated and read "
-                f"as white noise every {period_s:.2g} s. Or keep one reading in {every} (`every`) at "
-                f"{total:.2g}°.",
+                f"{self.correlation_s:.2g} s (a disturbed compass), while {np.degrees(stated):.2g}° is stated, which "
+                f"an estimator takes for white noise every {period_s:.2g} s. Instead of a larger sigma, one reading "
+                f"in {every} can be kept (`every`) at {total:.2g}°.",
                 f"streams.heading.sigma_deg: {np.degrees(equal):.2g}",
             )
         ]
 
 
-def _blamed_on_tilt(log: Log, imu: Inertial) -> float:
-    """Return the variance, rad², of headings that the level's lean in turns can make out of nothing.
+def _variance_from_tilt(log: Log, imu: Inertial) -> float:
+    """Return the variance of the heading error, rad², that a tilted level in turns can cause.
 
-    The accelerometers take a turning vehicle's own acceleration for a lean, and a lean of δ turns the azimuth of an
-    axis that is pitched by θ by δ tan θ. It may change its sign, and half the mean square of 2 δ tan θ is 2 (δ tan θ)².
+    Accelerometers take a turning vehicle's own acceleration for a tilt. A tilt of δ turns the azimuth of an axis that
+    is pitched by θ by δ tan θ. Its sign may change, and half the mean square of 2 δ tan θ is 2 (δ tan θ)².
     """
     mean_f = uniform_filter1d(imu.f_L, max(round(LEVEL_S / imu.period_s), 1), axis=0, mode="nearest")
     lean = np.sqrt(np.maximum(np.sum(mean_f**2, axis=1) / log.rig.gravity**2 - 1.0, 0.0))
@@ -338,8 +347,8 @@ def _blamed_on_tilt(log: Log, imu: Inertial) -> float:
     return float(2.0 * np.mean((lean * tilt) ** 2))
 
 
-def _spread_by_time(log: Log, imu: Inertial, found: GyroHeading) -> Spread | None:
-    """Compare heading errors some time apart; the gyro's own noise is taken off."""
+def _error_growth(log: Log, imu: Inertial, found: GyroHeading) -> ErrorGrowth | None:
+    """Compare heading errors some time apart; the gyro's own noise is subtracted."""
     t_s, left = found.t_s[found.kept], found.left[found.kept]
     if len(t_s) < 50:
         return None
@@ -375,13 +384,13 @@ def _spread_by_time(log: Log, imu: Inertial, found: GyroHeading) -> Spread | Non
     growth, _, top = max(growths, key=lambda each: each[0].value - each[0].reach)  # where it is surest
     slow = max(top - white, 0.0)
     correlation_s = next(lag for lag, value in shown if value - white >= 0.63 * slow)
-    return Spread(
-        shown[:: max(len(shown) // 6, 1)], max(white, 0.0), slow, correlation_s, growth, _blamed_on_tilt(log, imu)
+    return ErrorGrowth(
+        shown[:: max(len(shown) // 6, 1)], max(white, 0.0), slow, correlation_s, growth, _variance_from_tilt(log, imu)
     )
 
 
-def heading_against_truth(log: Log) -> Answer | None:
-    """Whether the heading is the truth's: offset, delay, deviation; None where the truth has no attitude."""
+def heading_against_truth(log: Log) -> PairCheck | None:
+    """Compare the heading with the truth's: offset, delay, deviation; None if the truth has no attitude."""
     truth = log.truth
     if truth is None or log.heading is None:
         return None
@@ -401,11 +410,11 @@ def heading_against_truth(log: Log) -> Answer | None:
     whose = log.truth_kind
     aligned, mirrored = (abs(np.exp(1j * (psi - sign * true)).mean()) for sign in (1, -1))
     if mirrored > 0.95 and mirrored > aligned + 0.05:
-        says = f"The heading turns against the {whose}'s: a compass is read as a yaw, or a yaw as a compass."
-        finding = Finding("heading", says, "streams.heading.convention: yaw  # or compass, whichever it is not")
-        return Answer(Check(f"heading against {whose}", {"turns": "the other way"}, (finding,)))
+        message = f"The heading turns against the {whose}'s: a compass is read as a yaw, or a yaw as a compass."
+        finding = Finding("heading", message, "streams.heading.convention: yaw  # or compass, whichever it is not")
+        return PairCheck(Check(f"heading against {whose}", {"turns": "the other way"}, (finding,)))
     if aligned < FOLLOWS:
-        return Answer(Check(f"heading against {whose}", {"turns": f"not with the {whose}"}))
+        return PairCheck(Check(f"heading against {whose}", {"turns": f"not with the {whose}"}))
     middle = float(np.angle(np.exp(1j * (psi - true)).mean()))
     error = np.angle(np.exp(1j * (psi - true - middle)))
     block = blocks_of(len(t_s))
@@ -436,11 +445,11 @@ def heading_against_truth(log: Log) -> Answer | None:
         axes.plot(np.degrees(true) % 360, np.degrees(error + middle), ".", markersize=2)
         axes.set(xlabel=f"yaw by {whose} (°)", ylabel="heading less it (°)", title=f"heading against {whose}")
 
-    return Answer(Check(f"heading against {whose}", facts, tuple(findings), draw), delays)
+    return PairCheck(Check(f"heading against {whose}", facts, tuple(findings), draw), delays)
 
 
 def _deviation(true: Array, left: Array, block: Index) -> dict[str, str]:
-    """Return the compass deviation's amplitudes once and twice around, where the vehicle went all around."""
+    """Return the amplitudes of the compass deviation, once and twice per turn, if the vehicle turned full circle."""
     sectors = np.unique(np.floor((true % (2 * np.pi)) / (np.pi / 4)))
     if len(sectors) < 8:
         return {}

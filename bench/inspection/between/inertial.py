@@ -1,4 +1,4 @@
-"""What the IMU alone says of the motion: level by its accelerometers, turned by its gyro."""
+"""The motion by the IMU alone: level from the accelerometers, rotation from the gyro."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ....datasets.log import Log
 from ....datasets.state import Array, TimeArray
 
 LEVEL_S = 2.0
-"""Over which the accelerometers are averaged: a vehicle's own acceleration tilts the level by a degree or two in turns,
-which a vertical rate feels in second order only."""
+"""The accelerometers are averaged over this. In turns the vehicle's own acceleration tilts the level by a degree or
+two, which changes the vertical rate only in second order."""
 UPSIDE_DOWN = np.radians(30.0)
-"""A mean up that leans further than this from B's z is a wrong mounting, no trim."""
+"""rad: a mean up that is further than this from B's z is a wrong mounting, and not the vehicle's trim."""
 
 ALONG_AN_AXIS = np.radians(15.0)
-"""What a vehicle's trim may be: a mean up that is nearer to an axis of B is taken for that axis."""
+"""rad: a mean up that is nearer to an axis of B than this is taken for that axis; a vehicle's trim is less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +30,9 @@ class Inertial:
         dt_s: (n,) their lengths.
         w_L, f_L: (n, 3) rad/s and m/s².
         up_L: (n, 3) unit vector.
-        R_LB: (3, 3) the shortest turn that brings the axis that is up onto z, where that is needed.
-        up_B: (3,) the mean up as the description has it.
-        flipped: whether all is well once the IMU's axes are taken for forward-right-down instead of forward-left-up.
+        R_LB: (3, 3) the shortest rotation that takes the axis that is up to z, if one is needed.
+        up_B: (3,) the mean up, with the mounting of the description.
+        flipped: whether up is up if the IMU's axes are read as forward-right-down instead of forward-left-up.
     """
 
     t_s: Array
@@ -50,9 +50,9 @@ class Inertial:
         return float(np.median(self.dt_s))
 
     def turned(self, h_L: Array | None = None) -> Array:
-        """Return how far (n,) rad an axis h of the body has turned about the vertical since the start.
+        """Return the azimuth (n,) rad of an axis h of the body since the start.
 
-        For the azimuth of h, whose height is u·h: (u·w − (u·h)(h·w)) / (1 − (u·h)²).
+        Its rate is (u·w − (u·h)(h·w)) / (1 − (u·h)²), with u up and w the angular rate.
         """
         h = np.array([1.0, 0.0, 0.0]) if h_L is None else h_L
         tilt = self.up_L @ h
@@ -60,7 +60,7 @@ class Inertial:
         return np.cumsum(rate * self.dt_s, dtype=np.float64)
 
     def level(self, t_s: Array) -> Array:
-        """Return R (k, 3, 3) from L to the level frame of yaw zero, at t_s (k,); z is up where no force tells."""
+        """Return R (k, 3, 3) from L to the level frame of yaw zero, at t_s (k,); without a specific force z is up."""
         up = np.stack([np.interp(t_s, self.t_s, self.up_L[:, i]) for i in range(3)], axis=1)
         size = np.linalg.norm(up, axis=1, keepdims=True)
         up = np.where(size > 1e-6, up / np.maximum(size, 1e-6), np.array([0.0, 0.0, 1.0]))
@@ -70,7 +70,7 @@ class Inertial:
 
 
 def inertial_of(log: Log) -> Inertial:
-    """Return what the IMU says, in L."""
+    """Return the IMU's samples in L, with the level."""
     R_BI = np.asarray(log.rig.imu.R_BS)
     t_s = seconds(log, log.imu.t_ns)
     period_s = log.imu.period_ns * 1e-9
@@ -100,20 +100,20 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def headings(log: Log) -> tuple[Array, Array]:
-    """Return when (n,) s, and the azimuth (n,) rad of the heading sensor's x axis, unwrapped."""
+    """Return times (n,) s, and the azimuth (n,) rad of the heading sensor's x axis, unwrapped."""
     assert log.heading is not None
     return seconds(log, log.heading.t_ns), np.unwrap(log.heading.psi)
 
 
 def yaw_by_heading(log: Log, imu: Inertial) -> tuple[Array, Array]:
-    """Return when (n,) s, and the yaw (n,) rad of L by the heading sensor, unwrapped."""
+    """Return times (n,) s, and the yaw (n,) rad of L by the heading sensor, unwrapped."""
     t_s, psi = headings(log)
     h = np.einsum("nij,j->ni", imu.level(t_s), np.asarray(log.rig.heading.R_BS)[:, 0])
     return t_s, psi - np.unwrap(np.arctan2(h[:, 1], h[:, 0]))
 
 
 def _nearest_axis(up: Array) -> Array:
-    """Return the axis that `up` runs along, as sensors are mounted, or `up` itself where it is far from any."""
+    """Return the axis nearest to `up`, or `up` itself if it is far from every axis."""
     best = int(np.argmax(np.abs(up)))
     axis = np.sign(up[best]) * np.eye(3)[best]
     return axis if axis @ up > np.cos(ALONG_AN_AXIS) else up

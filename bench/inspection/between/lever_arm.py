@@ -1,9 +1,9 @@
 """The IMU against the DVL: delay, mounting, lever arm, from velocities alone.
 
 The IMU's velocity over ground is v_I = v_B + w × p. In a frame that does not turn, it changes by specific force and
-gravity: R (A z + w × p) = V + v_0 + g t, with R the integrated gyro, V = ∫ R f dt, z what the DVL read, and A what
-turns (and scales) it into the IMU's axes. Start velocity v_0 and gravity g are any vectors, fitted anew in every
-window, so that neither attitude nor gravity is needed; both biases are fitted, too.
+gravity: R (A z + w × p) = V + v_0 + g t, with R the integrated gyro, V = ∫ R f dt, z the DVL's reading, and A the
+rotation and scale into the IMU's axes. Start velocity v_0 and gravity g are free vectors in every window, so neither
+attitude nor gravity need be known. Both biases are fitted as well.
 """
 
 from __future__ import annotations
@@ -17,25 +17,31 @@ from scipy.spatial.transform import Rotation
 from ....datasets.log import DvlStream, Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from .answers import Answer, Delay
 from .fitting import BLOCKS, Estimate, Fit, Index, blocks_of_windows, least_squares, windows_of, without_trend
 from .headings import mounting_text
 from .inertial import Inertial, cross
+from .pair_check import Delay, PairCheck
 from .path_fit import velocities
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DEGREE = np.pi / 180
+"""rad."""
 WINDOW_S = 20.0
+"""A start velocity and gravity are fitted per window: long enough for a turn, short enough for a consumer IMU."""
 DEGREE_OF_TREND = 2
-"""Of the polynomial taken off in each window: start velocity, gravity, and what a tilt that grows adds."""
+"""Of the polynomial removed in each window: start velocity, gravity, and the effect of a growing tilt."""
 LAGS_S = np.arange(-2.0, 2.01, 0.25)
+"""s: where the search for the delay starts."""
 ARM_MATTERS_M = 0.1
+"""At 0.1 rad/s an arm that is off by this makes 1 cm/s, the noise of a good DVL."""
 TURN_MATTERS = 2.0 * DEGREE
+"""rad: mountings are measured to about a degree, and this fit knows them to a fraction of one at best."""
 FASTEST_HZ = 25.0
-"""Samples are added up to about this rate first: nothing that a DVL sees is faster."""
+"""Samples are first summed to about this rate: a DVL sees nothing faster."""
 UNIT = np.eye(3)
+"""The three axes, by rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +74,7 @@ class Strapdown:
 
 
 def integrate(imu: Inertial, bias: Array) -> Strapdown:
-    """Integrate, the gyro less a bias (3,) rad/s."""
+    """Integrate the IMU, with a bias (3,) rad/s subtracted from the gyro."""
     many = max(int(1 / (imu.period_s * FASTEST_HZ)), 1)
     n = len(imu.t_s) // many * many
     dt_s = imu.dt_s[:n].reshape(-1, many).sum(axis=1)
@@ -101,12 +107,12 @@ def products(steps: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Mounted:
-    """What the DVL says of where the IMU sits.
+class MountingFit:
+    """The IMU's pose relative to the DVL, from their velocities.
 
     Attributes:
         delay: of the DVL after the IMU, s.
-        scale: what the DVL must be multiplied with to move as the accelerometers feel.
+        scale: factor on the DVL's velocity that makes it agree with the accelerometers.
         yaw: of the DVL's axes in L, rad.
         tilt: roll and pitch of them, rad.
         p_BI_B: IMU's place from the DVL, m, by axis of B.
@@ -122,8 +128,8 @@ class Mounted:
     left: Array
 
 
-def fit_mounting(log: Log, imu: Inertial) -> Mounted | None:
-    """Fit delay, turn and lever arm; None where IMU and DVL share too little."""
+def fit_mounting(log: Log, imu: Inertial) -> MountingFit | None:
+    """Fit delay, rotation and lever arm; None if IMU and DVL overlap too little."""
     t_s, z, never = velocities(log)
     inside = (t_s > imu.t_s[0] + 3) & (t_s < imu.t_s[-1] - 3)
     t_s, z = t_s[inside], z[inside]
@@ -144,7 +150,7 @@ def fit_mounting(log: Log, imu: Inertial) -> Mounted | None:
     place = back @ guess.arm
     arm_sigma = np.sqrt(np.diag(back @ _part(fit, [f"arm {axis}" for axis in "xyz"]) @ back.T))
     forward, left, up = (Estimate(float(place[i]), float(arm_sigma[i]), fit.dof) for i in range(3))
-    return Mounted(
+    return MountingFit(
         delay=Estimate(guess.delay_s, fit["delay"].sigma, fit.dof),
         scale=Estimate(guess.scale, fit["scale"].sigma * guess.scale, fit.dof),
         yaw=Estimate(float(np.angle(np.exp(1j * guess.yaw))), fit["turn z"].sigma, fit.dof),
@@ -156,7 +162,7 @@ def fit_mounting(log: Log, imu: Inertial) -> Mounted | None:
 
 
 def _converged(imu: Inertial, t_s: Array, z: Array, window: Index, guess: _Guess) -> tuple[Fit, _Guess] | None:
-    """Step from a guess to the fit's own; None where it runs away."""
+    """Iterate the fit from a guess; None if it does not converge."""
     found: Fit | None = None
     for _ in range(8):
         found = _fit(integrate(imu, guess.bias), t_s, z, window, guess)
@@ -172,7 +178,7 @@ def _converged(imu: Inertial, t_s: Array, z: Array, window: Index, guess: _Guess
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """Where the next step starts: delay s, A = scale · Rz(yaw), arm (3,) m in L, gyro bias (3,) rad/s in L."""
+    """The linearisation point: delay s, A = scale · Rz(yaw), arm (3,) m in L, gyro bias (3,) rad/s in L."""
 
     delay_s: float
     scale: float
@@ -186,7 +192,7 @@ class _Guess:
         return np.array([self.delay_s, self.scale, self.yaw, *self.arm, *self.bias])
 
     def stepped(self, fit: Fit) -> _Guess:
-        """Return the guess improved by a fit, by as much as the data fix and no more."""
+        """Return the guess moved by a fit, in the coefficients that the data determine."""
 
         def step(name: str, most: float) -> float:
             if name not in fit.names or not fit[name].known_to(3 * most):
@@ -212,10 +218,10 @@ def _in_windows(columns: dict[str, Array], t_s: Array, window: Index, degree: in
 
 
 def _fit(moved: Strapdown, t_s: Array, z: Array, window: Index, guess: _Guess) -> Fit | None:
-    """Fit what is missing from a guess.
+    """Fit the correction to a guess.
 
-    What the DVL read is noisy, so its noise stands on one side only: columns are made of the velocity as the IMU
-    carries it through the window, R z less what is left over.
+    The DVL's noise must be on one side of the equation only. So the columns are built from the velocity as the IMU
+    carries it through the window: R z less the residual.
     """
     at_s, step_s = t_s - guess.delay_s, 0.1
     R, V, w, G, J = (moved.at(at_s, name) for name in ("R", "V", "w", "G", "J"))
@@ -243,7 +249,7 @@ def _fit(moved: Strapdown, t_s: Array, z: Array, window: Index, guess: _Guess) -
 
 
 def _first_yaw(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> float:
-    """Return the DVL's yaw in L from a fit without a guess; zero where that does not tell."""
+    """Return the DVL's yaw in L from a fit without a guess; zero if that does not determine it."""
     R, V, w = (moved.at(t_s - delay_s, name) for name in ("R", "V", "w"))
     columns = {"along": _turn(R, z), "across": _turn(R, cross(UNIT[2], z))}
     columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
@@ -258,7 +264,7 @@ def _first_yaw(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: f
 
 
 def _best_lag(moved: Strapdown, t_s: Array, z: Array, window: Index) -> float | None:
-    """Return the delay (s) on a coarse grid that leaves least; parabolas in each window stand for the gyro's bias."""
+    """Return the delay (s) on a coarse grid with the least residual; a parabola per window covers the gyro's bias."""
     some = np.isin(window, np.unique(np.linspace(0, window[-1], 40).astype(np.intp)))
     t_s, z, window = t_s[some], z[some], window[some]
     left = []
@@ -275,7 +281,7 @@ def _best_lag(moved: Strapdown, t_s: Array, z: Array, window: Index) -> float | 
 
 
 def _signs(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> tuple[bool, bool]:
-    """Whether the map from the DVL to the IMU turns the horizontal over, and whether it turns up to down."""
+    """Whether the map from the DVL to the IMU mirrors the horizontal plane, and whether it swaps up and down."""
     R, V, w, G = (moved.at(t_s - delay_s, name) for name in ("R", "V", "w", "G"))
     G = G - G[np.searchsorted(window, window)]
     columns = {f"{a}{b}": _turn(R, z[:, [i]] * UNIT[j]) for i, a in enumerate("xy") for j, b in enumerate("xy")}
@@ -293,8 +299,8 @@ def _signs(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float
     return flat and area < -0.25, m["zz"].known_to(0.5) and m["zz"].value < -0.5
 
 
-def mirrored_dvl(log: Log, imu: Inertial) -> tuple[Answer, Log] | None:
-    """Return what to say of a DVL whose axes run against the IMU's, and the log with them turned; None if none do."""
+def mirrored_dvl(log: Log, imu: Inertial) -> tuple[PairCheck, Log] | None:
+    """Return the check of a DVL with axes opposite to the IMU's, and the log with them corrected; None if none are."""
     t_s, z, never = velocities(log)
     assert log.dvl is not None
     if len(t_s) < 60 or never:
@@ -307,16 +313,16 @@ def mirrored_dvl(log: Log, imu: Inertial) -> tuple[Answer, Log] | None:
         return None
     signs = np.array([1.0, -1.0 if flat else 1.0, -1.0 if vertical else 1.0])
     which = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
-    says = f"The DVL's {which} run{'s' * (which in 'xyz')} against the IMU's"
+    message = f"The DVL's {which} point{'s' * (which in 'xyz')} opposite to the IMU's"
     if flat and vertical:
-        says += ": forward-right-down and forward-left-up are taken for one another, in one of the two."
+        message += ": one of the two is read as forward-left-up and is forward-right-down, or the reverse."
         fix = "streams.dvl.axes: FRD  # or FLU, whichever it is not"
     else:
-        says += ": a sign is wrong."
+        message += ": a sign is wrong."
         fix = "streams.dvl.velocity.scale: [" + ", ".join(f"{sign:g}" for sign in signs) + "]"
     turned = DvlStream(log.dvl.t_ns, log.dvl.received_ns, log.dvl.z * signs, log.dvl.sigma)
-    check = Check("axes of the DVL against the IMU's", {"turned over": which}, (Finding("dvl", says, fix),))
-    return Answer(check), replace(log, dvl=turned)
+    check = Check("axes of the DVL against the IMU's", {"turned over": which}, (Finding("dvl", message, fix),))
+    return PairCheck(check), replace(log, dvl=turned)
 
 
 def _part(fit: Fit, names: list[str]) -> Array:
@@ -324,13 +330,13 @@ def _part(fit: Fit, names: list[str]) -> Array:
     return fit.cov[np.ix_(rows, rows)]
 
 
-def imu_against_dvl(log: Log, imu: Inertial) -> Answer | None:
-    """Whether IMU and DVL move as one rigid body, as the description mounts them."""
+def imu_against_dvl(log: Log, imu: Inertial) -> PairCheck | None:
+    """Whether IMU and DVL move as one rigid body with the mountings of the description."""
     found = fit_mounting(log, imu)
     if found is None:
-        says = "not observable: the IMU's noise over a window outweighs what the vehicle's velocity changes"
+        why = "not observable: over a window, the IMU's noise is larger than the changes of velocity"
         check = up_check(log, imu)
-        return Answer(Check("IMU against DVL", {"delay, mounting, lever arm": says, **check.facts}, check.findings))
+        return PairCheck(Check("IMU against DVL", {"delay, mounting, lever arm": why, **check.facts}, check.findings))
     facts = {"DVL later than the IMU by": found.delay.text_if(0.5, "s")}
     facts["DVL's axes in the IMU's as mounted, yaw"] = found.yaw.times(1 / DEGREE).text_if(15, "°")
     for name, tilt in zip(("roll", "pitch"), found.tilt, strict=True):
@@ -354,11 +360,11 @@ def imu_against_dvl(log: Log, imu: Inertial) -> Answer | None:
         )
 
     delays = (Delay("dvl", "imu", found.delay),) if found.delay.known_to(0.5) else ()
-    return Answer(Check("IMU against DVL", facts, tuple(findings), draw), delays)
+    return PairCheck(Check("IMU against DVL", facts, tuple(findings), draw), delays)
 
 
 def up_check(log: Log, imu: Inertial) -> Check:
-    """Whether the accelerometers, as they are mounted, say that B's z is up: what can be told without a DVL."""
+    """Whether B's z is up by the accelerometers as mounted; it needs no DVL."""
     lean = np.degrees(np.arccos(np.clip(imu.up_B[2], -1, 1)))
     facts = {"mean up in B": "({:.2f}, {:.2f}, {:.2f})".format(*imu.up_B), "leans from z by": f"{lean:.1f} °"}
     findings = () if np.allclose(imu.R_LB, UNIT) else (_mounting_finding(log, imu, _not_up(imu), UNIT),)
@@ -367,19 +373,19 @@ def up_check(log: Log, imu: Inertial) -> Check:
 
 def _not_up(imu: Inertial) -> str:
     up = "({:.2f}, {:.2f}, {:.2f})".format(*imu.up_B)
-    says = f"B's z, as the IMU is mounted, is not up: the mean specific force points to {up}."
-    return says + " Forward-right-down is read as forward-left-up, or the reverse." * imu.flipped
+    message = f"With this mounting of the IMU, B's z is not up: the mean specific force points to {up}."
+    return message + " Forward-right-down is read as forward-left-up, or the reverse." * imu.flipped
 
 
-def _mounting_finding(log: Log, imu: Inertial, says: str, back: Array) -> Finding:
-    """Return what mounts the IMU so that up is up, turned `back` besides."""
+def _mounting_finding(log: Log, imu: Inertial, message: str, back: Array) -> Finding:
+    """Return the finding with the mounting of the IMU that makes B's z up, rotated further by `back`."""
     if imu.flipped and np.allclose(back, UNIT):
-        return Finding("imu", says, "streams.imu.axes: FRD  # or FLU, whichever it is not")
+        return Finding("imu", message, "streams.imu.axes: FRD  # or FLU, whichever it is not")
     R_BI = back @ imu.R_LB @ np.asarray(log.rig.imu.R_BS)
-    return Finding("imu", says, "streams.imu.mounting: " + mounting_text(R_BI, np.asarray(log.rig.imu.p_BS_B)))
+    return Finding("imu", message, "streams.imu.mounting: " + mounting_text(R_BI, np.asarray(log.rig.imu.p_BS_B)))
 
 
-def _findings(log: Log, imu: Inertial, found: Mounted, incomplete: bool) -> list[Finding]:
+def _findings(log: Log, imu: Inertial, found: MountingFit, incomplete: bool) -> list[Finding]:
     roll, pitch = (
         tilt.value if not incomplete and tilt.known_to(10 * DEGREE) and tilt.differs(0.0, TURN_MATTERS) else 0.0
         for tilt in found.tilt
@@ -388,14 +394,14 @@ def _findings(log: Log, imu: Inertial, found: Mounted, incomplete: bool) -> list
     tilted = Rotation.from_rotvec([-roll, -pitch, 0.0]).as_matrix()
     back = (Rotation.from_euler("z", -found.yaw.value).as_matrix() if turned else UNIT) @ tilted
     if not np.allclose(imu.R_LB, UNIT):
-        return [_mounting_finding(log, imu, _not_up(imu) + " What turn is left is from the DVL.", back)]
+        return [_mounting_finding(log, imu, _not_up(imu) + " The remaining rotation is from the DVL.", back)]
     if turned or roll or pitch:
         yaw, *tilts = (e.times(1 / DEGREE).text("°") for e in (found.yaw, *found.tilt))
-        says = (
+        message = (
             f"The DVL's axes are turned by {yaw} in yaw, {tilts[0]} in roll and {tilts[1]} in pitch from the IMU's as "
-            "mounted. A heading sensor in the IMU's housing is turned alike."
+            "mounted. A heading sensor in the IMU's housing is turned by the same."
         )
-        return [_mounting_finding(log, imu, says, back)]
+        return [_mounting_finding(log, imu, message, back)]
     stated = np.asarray(log.rig.imu.p_BS_B)
     wrong = [
         i for i, arm in enumerate(found.p_BI_B) if arm.known_to(0.5) and arm.differs(float(stated[i]), ARM_MATTERS_M)
@@ -411,7 +417,7 @@ def _findings(log: Log, imu: Inertial, found: Mounted, incomplete: bool) -> list
     return [
         Finding(
             "imu",
-            f"By their velocities in turns, the IMU sits {listed} of the DVL.",
+            f"From their velocities in turns, the IMU is {listed} of the DVL.",
             "streams.imu.mounting.translation_m: [" + ", ".join(f"{x:.2f}" for x in place) + "]",
         )
     ]

@@ -1,7 +1,7 @@
-"""The DVL's path, turned by the heading or the gyro, laid on positions.
+"""Fit of the DVL's path, rotated by heading or gyro, to positions.
 
-A path x(t) = ∫ v e^{iψ} dt, east + i north, fits a position as p(t) = z x(t) + c, z = scale · e^{i turn}, with a c of
-its own in each stretch of the log, so that slow drift is nobody's error.
+A path x(t) = ∫ v e^{iψ} dt, east + i north, fits a position as p(t) = z x(t) + c, z = scale · e^{i turn}. Each block of
+the log has its own c, which absorbs slow drift.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from .fitting import BLOCKS, Estimate, Fit, Index, Mask, Plane, blocks_of_window
 from .inertial import Inertial, seconds, yaw_by_heading
 
 POSITION_PERIOD_S = 0.5
+"""Positions closer than this are thinned: they add rows but no information at the speed of a vehicle."""
 GAP_S = 5.0
+"""A silence of the DVL that is longer ends a window: dead reckoning across it is metres off."""
 ARM_DOUBT_M = 0.3
-"""No lever arm is trusted beyond this, and at a steady speed one looks like a delay."""
+"""Uncertainty of every lever arm. At a constant speed an error of the arm looks like a delay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +38,13 @@ class PathFit:
     """p(t − delay) = scale · e^{i turn} · x, and the DVL read `dvl_delay` after the yaw that turns it.
 
     Attributes:
-        scale, turn: what the path must be multiplied with, and turned by (rad, counter-clockwise).
+        scale, turn: factor on the path, and its rotation (rad, counter-clockwise).
         dvl_delay: of the DVL after the yaw, s.
         delay: of the positions after the yaw, s.
-        bias: rate (rad/s) taken from the yaw where it is a gyro's; None where a heading sensor turns the path.
-        rms_m: of what is left within a stretch, per axis.
-        mirrored: whether the path fits far better turned over.
-        x, p: (n,) what is laid on what, each less its mean in each stretch; t_s (n,).
+        bias: rate (rad/s) subtracted from a yaw by gyro; None with a heading sensor.
+        rms_m: of the residuals within a window, per axis.
+        mirrored: whether the mirrored path fits far better.
+        x, p: (n,) fitted path and positions, each less its mean in each window; t_s (n,).
     """
 
     scale: Estimate
@@ -66,7 +68,7 @@ def velocities(log: Log) -> tuple[Array, Array, list[str]]:
 
 
 def positions(log: Log, imu: Inertial) -> list[Positions]:
-    """Return the positions there are: the truth's and the GPS's, brought to B as far as the level allows."""
+    """Return the positions of GPS and truth, moved from the antenna to B if heading and level allow it."""
     found = []
     if log.gps is not None:
         good = np.isfinite(log.gps.sigma[:, :2]).all(axis=1)
@@ -105,7 +107,7 @@ class Track:
     yaw: Array
 
     def at(self, t_s: Array, dvl_delay_s: float, bias: float, mirror: bool = False) -> Plane:
-        """Return x(t_s), where the DVL is late, the yaw's rate is biased (rad/s), or the path is turned over."""
+        """Return x(t_s) for a delay of the DVL, a bias of the yaw's rate (rad/s), or the mirrored path."""
         t_true = self.t_s - dvl_delay_s
         each = self.v * np.exp(1j * (np.interp(t_true, self.t_yaw, self.yaw) - bias * t_true))
         if mirror:
@@ -116,8 +118,8 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Laying:
-    """A track to be laid on positions p (m,) at t_s (m,), each less its mean in each window."""
+class PathFitProblem:
+    """A track to fit to positions p (m,) at t_s (m,), each less its mean in each window."""
 
     track: Track
     t_s: Array
@@ -151,8 +153,8 @@ class Laying:
 
 
 def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | None:
-    """Lay the DVL's path, turned "by" heading or gyro, on positions; None where they share too little."""
-    laying = _laying(log, imu, where, by)
+    """Fit the DVL's path, rotated `by` "heading" or "gyro", to positions; None if they overlap too little."""
+    laying = _path_fit_problem(log, imu, where, by)
     if laying is None:
         return None
     dvl_s, delay_s, bias = 0.0, 0.0, 0.0
@@ -187,8 +189,8 @@ def fit_path(log: Log, imu: Inertial, where: Positions, by: str) -> PathFit | No
     )
 
 
-def _laying(log: Log, imu: Inertial, where: Positions, by: str) -> Laying | None:
-    """Return what is to be laid on what; None where DVL, yaw and positions share too little."""
+def _path_fit_problem(log: Log, imu: Inertial, where: Positions, by: str) -> PathFitProblem | None:
+    """Return the track and the positions to fit it to; None if DVL, yaw and positions overlap too little."""
     t_dvl, v_B, _ = velocities(log)
     if len(t_dvl) < 30:
         return None
@@ -201,11 +203,11 @@ def _laying(log: Log, imu: Inertial, where: Positions, by: str) -> Laying | None
     v_level = np.einsum("nij,nj->ni", imu.level(t_dvl), v_B)
     track = Track(t_dvl, v_level[:, 0] + 1j * v_level[:, 1], t_yaw, yaw)
     window = _stretches(t_s, t_dvl)
-    return Laying(track, t_s, without_trend(where.p[inside], t_s, window, 0), window, by)
+    return PathFitProblem(track, t_s, without_trend(where.p[inside], t_s, window, 0), window, by)
 
 
-def _fits_turned_over(laying: Laying) -> bool:
-    """Return whether the path fits far better with left and right exchanged."""
+def _fits_turned_over(laying: PathFitProblem) -> bool:
+    """Return whether the path fits far better with left and right exchanged (0.3 of the rms)."""
     over, _ = laying.fit(0.0, 0.0, 0.0, mirror=True)
     straight, _ = laying.fit(0.0, 0.0, 0.0)
     return over is not None and straight is not None and over.rms < 0.3 * straight.rms

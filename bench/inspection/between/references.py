@@ -1,4 +1,4 @@
-"""The truth, or the reference, against itself and against the sensors that see the same: GPS, depth, DVL."""
+"""Truth or reference against itself, and against the sensors that see the same: GPS, depth, DVL."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from ....datasets.log import Log
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
-from .answers import Answer, Delay
 from .fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
 from .inertial import Inertial, cross, seconds
+from .pair_check import Delay, PairCheck
 from .path_fit import velocities
 from .velocity import SCALE_MATTERS
 
@@ -22,17 +22,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DEGREE = np.pi / 180
+"""rad."""
 DRIFT_MATTERS_M_S = 0.02
+"""A velocity that is off its own positions by this would be the largest part of most velocity scores."""
 OFFSET_MATTERS_M = 1.0
+"""Below a metre an offset is within a GPS fix."""
 DEPTH_OFFSET_MATTERS_M = 0.2
+"""The tide over an hour, or the height of the sensor in a hull, is as much."""
 SPEED_MATTERS_M_S = 0.05
+"""A DVL's bias is 1 % of its speed at worst, and 5 cm/s is more than that at 4 m/s."""
 TURN_MATTERS = 1.0 * DEGREE
+"""rad: mountings are measured to about a degree."""
 AXES = ("east", "north", "up")
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The truth at equal steps: t_s (n,), p_W and v_W (n, 3), R_WB (n, 3, 3), NaN where unknown."""
+    """The truth: t_s (n,), p_W and v_W (n, 3), R_WB (n, 3, 3), NaN where unknown."""
 
     t_s: Array
     p_W: Array
@@ -46,16 +52,16 @@ class Reference:
         return found.reshape(len(t_s), *values.shape[1:])
 
     def covers(self, t_s: Array) -> Mask:
-        """Return which times (n,) lie a second inside, within a second of a row."""
+        """Return which times (n,) are at least a second inside the span, in a gap of rows under 2 s."""
         near = np.searchsorted(self.t_s, t_s).clip(1, len(self.t_s) - 1)
         gap = self.t_s[near] - self.t_s[near - 1]
         return np.asarray((t_s > self.t_s[0] + 1) & (t_s < self.t_s[-1] - 1) & (gap < 2.0))
 
 
 def reference_of(log: Log) -> Reference | None:
-    """Return the truth.
+    """Return the truth, with a velocity.
 
-    Where it states no velocity, or one that its positions do not follow, they are differenced over a second.
+    If the truth has no velocity, or one that its positions contradict, positions are differenced over a second.
     """
     truth = log.truth
     if truth is None or len(truth) < 30:
@@ -76,7 +82,7 @@ def reference_of(log: Log) -> Reference | None:
 
 
 def _at_sensor(log: Log, reference: Reference, t_ns: TimeArray, p_BS_B: Array) -> tuple[Array, Mask, Array]:
-    """Return of a sensor's times those that the reference covers, which they are, and where it was then (n, 3) m."""
+    """Return the times of a sensor that the reference covers, their mask, and the sensor's position then (n, 3) m."""
     t_s = seconds(log, t_ns)
     inside = reference.covers(t_s)
     t_s = t_s[inside]
@@ -84,8 +90,8 @@ def _at_sensor(log: Log, reference: Reference, t_ns: TimeArray, p_BS_B: Array) -
     return t_s, inside, reference.at(t_s, reference.p_W) + R_WB @ p_BS_B
 
 
-def truth_against_itself(log: Log) -> Answer | None:
-    """Whether the truth's positions move as its velocities say; None where it states none."""
+def truth_against_itself(log: Log) -> PairCheck | None:
+    """Whether the truth's positions agree with its velocities; None if it has no velocities."""
     truth = log.truth
     if truth is None or truth.v_WB_W is None or len(truth) < 30:
         return None
@@ -103,11 +109,11 @@ def truth_against_itself(log: Log) -> Answer | None:
     for name in AXES:
         facts[f"velocity less what the positions do, {name}"] = fit[name].text("m/s")
         if fit[name].differs(0.0, DRIFT_MATTERS_M_S):
-            says = (
-                f"The {whose}'s velocity {name} is {fit[name].text('m/s')} off what its own positions do: do not "
+            message = (
+                f"The {whose}'s velocity {name} is {fit[name].text('m/s')} off the rate of its own positions: do not "
                 "score velocities against it, or leave `truth.velocity` out."
             )
-            findings.append(Finding("truth", says, "truth.velocity: null"))
+            findings.append(Finding("truth", message, "truth.velocity: null"))
     facts["positions later than velocities by"] = fit["delay"].text_if(0.5, "s")
     known = fit["delay"].known_to(0.5)
     delays = (Delay("truth position", "truth velocity", fit["delay"]),) if known else ()
@@ -119,11 +125,11 @@ def truth_against_itself(log: Log) -> Answer | None:
         axes.legend(fontsize=7)
         axes.set(xlabel="time (min)", ylabel="∫ velocity less position (m)", title=f"{whose} against itself")
 
-    return Answer(Check(f"{whose} against itself", facts, tuple(findings), draw), delays)
+    return PairCheck(Check(f"{whose} against itself", facts, tuple(findings), draw), delays)
 
 
-def gps_against_truth(log: Log, reference: Reference) -> Answer | None:
-    """Whether GPS and truth agree in place, height and time."""
+def gps_against_truth(log: Log, reference: Reference) -> PairCheck | None:
+    """Whether GPS and truth agree in position, height and time."""
     if log.gps is None:
         return None
     t_s, inside, place = _at_sensor(log, reference, log.gps.t_ns, log.rig.gps.p_BS_B)
@@ -133,9 +139,9 @@ def gps_against_truth(log: Log, reference: Reference) -> Answer | None:
     error = z - place
     swapped = z[:, [1, 0]] - place[:, :2]
     if np.median(np.abs(swapped)) < 0.2 * np.median(np.abs(error[:, :2])):
-        says = f"GPS lies on the {log.truth_kind} only with east and north exchanged: one of the two is read as NED."
-        finding = Finding("gps", says, "streams.gps.frame: NED  # or ENU, whichever it is not")
-        return Answer(Check(f"GPS against {log.truth_kind}", {"lies": "exchanged, east for north"}, (finding,)))
+        message = f"GPS lies on the {log.truth_kind} only with east and north exchanged: one of the two is read as NED."
+        finding = Finding("gps", message, "streams.gps.frame: NED  # or ENU, whichever it is not")
+        return PairCheck(Check(f"GPS against {log.truth_kind}", {"lies": "exchanged, east for north"}, (finding,)))
     v = reference.at(t_s, reference.v_W)
     block = blocks_of(len(t_s))
     whose = log.truth_kind
@@ -156,25 +162,25 @@ def gps_against_truth(log: Log, reference: Reference) -> Answer | None:
     findings = []
     stated = float(np.median(sigma[flat, :2]))
     if any(fit[name].differs(0.0, max(OFFSET_MATTERS_M, 2 * stated)) for name in ("east", "north")):
-        says = f"GPS lies {fit['east'].text('m')} east and {fit['north'].text('m')} north of the {whose}."
-        findings.append(Finding("gps", says + " Origins, datums or lever arms differ."))
+        message = f"GPS lies {fit['east'].text('m')} east and {fit['north'].text('m')} north of the {whose}."
+        findings.append(Finding("gps", message + " Origins, datums or lever arms differ."))
     high = np.isfinite(sigma[:, 2])
     up = mean_of(error[high, 2], block[high]) if np.count_nonzero(high) > 30 else None
     if up is not None:
         facts[f"GPS less {whose}, up"] = up.text("m")
         if up.differs(0.0, max(OFFSET_MATTERS_M, 2 * float(np.median(sigma[high, 2])))):
-            says = f"GPS heights are {up.text('m')} above the {whose}'s: ellipsoid and geoid, or different origins."
-            findings.append(Finding("gps", says, f"streams.gps.geodetic.altitude.offset: {-up.value:.2f}"))
+            message = f"GPS heights are {up.text('m')} above the {whose}'s: ellipsoid and geoid, or different origins."
+            findings.append(Finding("gps", message, f"streams.gps.geodetic.altitude.offset: {-up.value:.2f}"))
     delays = (Delay("gps", "truth position", fit["delay"]),) if fit["delay"].known_to(1.0) else ()
 
     def draw(axes: Axes) -> None:
         axes.plot(error[flat, 0], error[flat, 1], ".", markersize=2)
         axes.set(xlabel="east (m)", ylabel="north (m)", title=f"GPS less {whose}", aspect="equal")
 
-    return Answer(Check(f"GPS against {whose}", facts, tuple(findings), draw), delays)
+    return PairCheck(Check(f"GPS against {whose}", facts, tuple(findings), draw), delays)
 
 
-def depth_against_truth(log: Log, reference: Reference) -> Answer | None:
+def depth_against_truth(log: Log, reference: Reference) -> PairCheck | None:
     """Whether depth sensor and truth agree on the height."""
     if log.depth is None:
         return None
@@ -201,19 +207,19 @@ def depth_against_truth(log: Log, reference: Reference) -> Answer | None:
         facts[f"depth sensor later than {whose} by"] = fit["delay"].text_if(0.5, "s")
         delays = (Delay("depth", "truth position", fit["delay"]),) if fit["delay"].known_to(0.5) else ()
         if scale.differs(1.0, 0.01):
-            says = f"The depth sensor reads {scale.text()} of the {whose}'s changes in height: unit, sign or density."
+            message = f"The depth sensor reads {scale.text()} of the {whose}'s height changes: unit, sign or density."
             turned = abs(scale.value + 1) < 0.05
-            mend = f"streams.depth.depth.scale: {1 / scale.value:.4g}"
-            mend = "streams.depth.positive: up  # or down, whichever it is not" if turned else mend
-            findings.append(Finding("depth", says, mend))
+            fix = f"streams.depth.depth.scale: {1 / scale.value:.4g}"
+            fix = "streams.depth.positive: up  # or down, whichever it is not" if turned else fix
+            findings.append(Finding("depth", message, fix))
     if offset.differs(0.0, DEPTH_OFFSET_MATTERS_M) and not findings:
         shift = offset.value
         if log.truth_kind == "reference" or abs(shift) > 5.0:
-            mend = f"truth.position.offset: [0, 0, {-shift:.3f}]  # frame: NED; with ENU {shift:.3f}"
+            fix = f"truth.position.offset: [0, 0, {-shift:.3f}]  # frame: NED; with ENU {shift:.3f}"
         else:
-            mend = f"streams.depth.depth.offset: {shift:.3f}  # positive: down; with up {-shift:.3f}"
-        says = f"The {whose}'s height is {offset.times(-1).text('m')} above the depth sensor's, constantly."
-        findings.append(Finding("truth" if mend.startswith("truth") else "depth", says, mend))
+            fix = f"streams.depth.depth.offset: {shift:.3f}  # positive: down; with up {-shift:.3f}"
+        message = f"The {whose}'s height is {offset.times(-1).text('m')} above the depth sensor's throughout."
+        findings.append(Finding("truth" if fix.startswith("truth") else "depth", message, fix))
 
     def draw(axes: Axes) -> None:
         axes.plot(t_s / 60, z, label="depth sensor")
@@ -221,11 +227,11 @@ def depth_against_truth(log: Log, reference: Reference) -> Answer | None:
         axes.legend(fontsize=7)
         axes.set(xlabel="time (min)", ylabel="height (m)", title=f"depth against {whose}")
 
-    return Answer(Check(f"depth against {whose}", facts, tuple(findings), draw), delays)
+    return PairCheck(Check(f"depth against {whose}", facts, tuple(findings), draw), delays)
 
 
-def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> Answer | None:
-    """Whether the DVL reads the truth's velocity, axis by axis; None where the truth has no attitude."""
+def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> PairCheck | None:
+    """Compare the DVL with the truth's velocity, axis by axis; None if the truth has no attitude."""
     if log.dvl is None or not np.isfinite(reference.R_WB).any():
         return None
     t_s, z, _ = velocities(log)
@@ -255,8 +261,8 @@ def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> Answer |
             facts[f"DVL less {whose}, {axis}"] = mean.text("m/s")
             stated = float(np.median(log.dvl.sigma[inside][known[:, i], i]))
             if mean.differs(0.0, max(SPEED_MATTERS_M_S, stated)):
-                says = f"The DVL reads {mean.text('m/s')} more {axis} than the {whose} moves."
-                more.append(Finding("dvl", says))
+                message = f"The DVL reads {mean.text('m/s')} more {axis} than the {whose}'s velocity."
+                more.append(Finding("dvl", message))
     facts[f"DVL by {whose}, scale"] = scale.text_if(0.3)
     facts[f"DVL later than {whose} by"] = delay.text_if(0.5, "s")
     turned = Rotation.from_matrix(R_BD).as_rotvec()
@@ -266,12 +272,12 @@ def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> Answer |
         turn = Estimate(float(turned[i]), fit[f"turn {axis}"].sigma, fit.dof)
         facts[f"DVL's axes in the {whose}'s, {name}"] = turn.times(1 / DEGREE).text_if(10.0, "°")
         if turn.known_to(10 * DEGREE) and turn.differs(0.0, TURN_MATTERS):
-            says = (
+            message = (
                 f"The DVL's axes are turned by {turn.times(1 / DEGREE).text('°')} in {name} from those of the {whose}. "
-                "The DVL's axes are the body's: it is the mountings of the other sensors, and the truth's attitude, "
-                "that must be turned the other way."
+                "The DVL's axes are the body's, so the mountings of the other sensors, and the truth's attitude, must "
+                "be turned the other way."
             )
-            findings.append(Finding("dvl", says))
+            findings.append(Finding("dvl", message))
     findings = findings or ([] if scale.differs(1.0, SCALE_MATTERS) else more)
     arm = [
         Estimate(float(p_BD_B[i]), fit[f"arm {axis}"].sigma, fit.dof) if f"arm {axis}" in fit.names else None
@@ -288,7 +294,7 @@ def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> Answer |
         axes.legend(fontsize=7)
         axes.set(xlabel="time (min)", ylabel="m/s", title=f"DVL less velocity of the {whose}")
 
-    return Answer(Check(f"DVL against the velocity of the {whose}", facts, tuple(findings), draw), delays)
+    return PairCheck(Check(f"DVL against the velocity of the {whose}", facts, tuple(findings), draw), delays)
 
 
 def _fit_velocity(
@@ -297,7 +303,7 @@ def _fit_velocity(
     """Fit z(t) = scale · R_DB (v_B + w × p)(t − delay) to the measured axes.
 
     Returns:
-        The last fit, scale, delay, R_BD (3, 3) and p_BD_B (3,); None where it cannot be told.
+        The last fit, scale, delay, R_BD (3, 3) and p_BD_B (3,); None if the data do not determine them.
     """
     scale, delay_s, R_BD, p_BD_B = 1.0, 0.0, np.eye(3), np.zeros(3)
     block, rows, step_s = np.repeat(blocks_of(len(t_s)), 3), known.ravel(), 0.1
@@ -321,7 +327,7 @@ def _fit_velocity(
             return None
 
         def step(name: str, most: float, fit: Fit = fit) -> float:
-            """Return a coefficient's step, none where the data do not fix it."""
+            """Return a coefficient's step; zero if the data do not determine it."""
             usable = name in fit.names and fit[name].known_to(20 * most)
             return float(np.clip(fit[name].value, -most, most)) if usable else 0.0
 

@@ -1,4 +1,4 @@
-"""The DVL against positions: is its path as long as the GPS's, or the truth's, and does it run where theirs does?"""
+"""The DVL against positions: scale and direction of its path, compared with GPS or truth."""
 
 from __future__ import annotations
 
@@ -8,20 +8,23 @@ import numpy as np
 
 from ....datasets.log import Log
 from ..findings.finding import Check, Finding
-from .answers import Answer, Delay
 from .inertial import Inertial
+from .pair_check import Delay, PairCheck
 from .path_fit import PathFit, Positions, fit_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DEGREE = np.pi / 180
+"""rad."""
 SCALE_MATTERS = 0.01
+"""Relative: what a low-cost DVL is specified to (Water Linked A50: 1.01 % long-term)."""
 TURN_MATTERS = 1.0 * DEGREE
+"""rad: 1.7 % of the distance travelled, across the track; a magnetic compass is good to 1 to 2°."""
 
 
-def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> Answer | None:
-    """Whether the DVL's path is as long as the positions' and runs where theirs does."""
+def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> PairCheck | None:
+    """Compare length and direction of the DVL's path with those of the positions."""
     by = "gyro" if log.heading is None else "heading"
     found = fit_path(log, imu, where, by)
     if found is None:
@@ -32,13 +35,15 @@ def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> Answer |
     facts["rms left in a twelfth of the log"] = f"{found.rms_m:.2g} m per axis"
     findings: list[Finding] = []
     if found.mirrored:
-        says = (
-            f"The DVL's path fits the {whose}'s only turned over: north and east are exchanged, or the heading "
+        message = (
+            f"The DVL's path fits the {whose}'s only if mirrored: north and east are exchanged, or the heading "
             "turns the wrong way (a compass read as a yaw)."
         )
         part = "streams.gps" if whose == "GPS" else "truth"
-        says += f" Or `{part}.frame` is wrong."
-        findings.append(Finding("heading", says, "streams.heading.convention: yaw  # or compass, whichever it is not"))
+        message += f" Or `{part}.frame` is wrong."
+        findings.append(
+            Finding("heading", message, "streams.heading.convention: yaw  # or compass, whichever it is not")
+        )
     elif moved:
         facts[f"turn of the DVL's path onto the {whose}'s"] = (
             found.turn.times(1 / DEGREE).text("°") if by == "heading" else "free: no heading sensor"
@@ -63,7 +68,7 @@ def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> Answer |
         axes.set(xlabel="time (min)", ylabel=f"{whose} less DVL's path (m)", title=f"DVL against {whose}")
 
     kept = tuple(delay for delay in delays if delay.by.known_to(0.5))
-    return Answer(Check(f"DVL against the positions of the {whose}", facts, tuple(findings), draw), kept)
+    return PairCheck(Check(f"DVL against the positions of the {whose}", facts, tuple(findings), draw), kept)
 
 
 def _scale_findings(found: PathFit, whose: str) -> list[Finding]:
@@ -76,7 +81,7 @@ def _scale_findings(found: PathFit, whose: str) -> list[Finding]:
     return [
         Finding(
             "dvl",
-            f"The DVL's path must be multiplied by {found.scale.text()} to be as long as the {whose}'s.{guess}",
+            f"The DVL's path must be scaled by {found.scale.text()} to be as long as the {whose}'s.{guess}",
             f"streams.dvl.velocity.unit: {near[0]}" if near else f"streams.dvl.velocity.scale: {scale:.4g}",
         )
     ]
@@ -87,13 +92,13 @@ def _turn_findings(log: Log, found: PathFit, whose: str) -> list[Finding]:
         return []
     attitude = log.truth is not None and bool(np.isfinite(log.truth.R_WB).all(axis=(1, 2)).any())
     if attitude and whose != "GPS":
-        return []  # its attitude says whether heading or DVL is turned: other checks tell
+        return []  # checks against its attitude tell whether the heading or the DVL is turned
     add = np.degrees(found.turn.value)
     return [
         Finding(
             "heading",
-            f"Dead reckoned with DVL and heading, the path must be turned by {found.turn.times(1 / DEGREE).text('°')} "
-            f"counter-clockwise to run as the {whose}'s: declination, deviation or mounting of the heading sensor, or "
+            f"The path by DVL and heading must be turned by {found.turn.times(1 / DEGREE).text('°')} "
+            f"counter-clockwise to match the {whose}'s: declination, deviation or mounting of the heading sensor, or "
             "the DVL's own yaw on the vehicle.",
             f"streams.heading.add_deg: {-add:.1f}  # convention: compass; with yaw {add:.1f}",
         )

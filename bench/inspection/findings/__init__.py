@@ -1,1 +1,1 @@
-"""What a check hands over: facts, findings with their remedy, and a panel for the page."""
+"""The result of a check: measured facts, findings with their fix, and a panel for the page."""

@@ -1,4 +1,4 @@
-"""What a check of a log hands over: what it measured, what looks wrong, and a panel for the page."""
+"""The result of a check of a log: what it measured, what looks wrong, and a panel for the page."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ class Finding:
     """Something that looks wrong.
 
     Attributes:
-        stream: where, as the description calls it: "imu", "dvl", "truth".
-        says: one plain sentence with its figures.
-        mend: what to put into log.yaml, by its path ("streams.dvl.time.delay_s: 0.5"); "" where that helps nothing.
+        stream: the stream concerned, by its name in log.yaml: "imu", "dvl", "truth".
+        message: one sentence with its figures.
+        fix: what to put into log.yaml, by its path ("streams.dvl.time.delay_s: 0.5"); "" where no key helps.
     """
 
     stream: str
-    says: str
-    mend: str = ""
+    message: str
+    fix: str = ""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One question put to a log, and its answer.
+    """The result of one check.
 
     Attributes:
-        title: the question, as a heading: "gyro against heading".
+        title: a heading: "gyro against heading".
         facts: what was measured, by name, with its unit.
-        findings: what of it looks wrong.
-        draw: draws the panel, where people would rather look than read.
+        findings: what looks wrong.
+        draw: draws the panel; None for a check without one.
     """
 
     title: str

@@ -1,1 +1,1 @@
-"""What is looked at in one stream alone."""
+"""Checks of one stream by itself: rates, values, outliers, gravity, rest, noise."""

@@ -1,4 +1,4 @@
-"""Allan deviation, and what it says of an inertial sensor: white density and bias instability."""
+"""Allan deviation, and the white density and bias instability read from it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from ....datasets.state import Array
 
 PER_DECADE = 10
+"""Averaging times per decade: enough to see a slope over a third of one."""
 FEWEST_CLUSTERS = 9
-"""Independent clusters that the longest τ must leave: its Allan deviation is then known to about a quarter."""
+"""Independent clusters at the longest τ: its Allan deviation is then known to about a quarter."""
 SLOPE_TOLERANCE = 0.15
+"""Of the slope in the log-log plot: half way from white noise (−1/2) to where flicker noise has a visible part."""
 FLICKER = float(np.sqrt(2 * np.log(2) / np.pi))
 """Allan deviation of flicker noise over its coefficient B, the bias instability (IEEE Std 952, C.1.3): 0.664."""
 
@@ -33,7 +35,7 @@ class AllanCurve:
 
 
 def averaging_factors(n: int) -> NDArray[np.int64]:
-    """Return numbers of samples to average over, ten a decade, as long as nine clusters are left of n samples."""
+    """Return numbers of samples to average over, ten per decade, up to nine clusters of n samples."""
     longest = n // FEWEST_CLUSTERS
     if longest < 1:
         return np.zeros(0, np.int64)
@@ -60,10 +62,10 @@ def allan_deviation(rates: Array, period_s: float, factors: NDArray[np.int64] | 
 
 
 def white_density(curve: AllanCurve) -> Array:
-    """Return (k,) N, read at τ = 1 s off the line of slope −1/2 through the part of the curve that has that slope.
+    """Return (k,) N: at τ = 1 s, the line of slope −1/2 through the part of the curve that has that slope.
 
-    The part begins at the least σ √τ of well known points and reaches as far as the slope stays within 0.15 of −1/2;
-    where no point has it, the least σ √τ is the answer, and an upper bound.
+    The part begins at the least σ √τ of well known points and extends while the slope is within 0.15 of −1/2. If no
+    point has that slope, the least σ √τ is returned, an upper bound.
     """
     root_tau = curve.deviation * np.sqrt(curve.tau_s)[:, None]
     known = curve.clusters >= 5 * FEWEST_CLUSTERS
@@ -82,7 +84,7 @@ def white_density(curve: AllanCurve) -> Array:
             first -= 1
         while last + 1 < len(axis) and white[last + 1]:
             last += 1
-        weight = curve.clusters[first : last + 1]  # the variance of a log deviation goes as one over them
+        weight = curve.clusters[first : last + 1]  # the variance of a log deviation is inversely proportional
         densities[k] = np.exp(np.average(np.log(axis[first : last + 1]), weights=weight))
     return densities
 

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ....datasets.log import AttitudeStream, Log, ReadingStream
 from ....datasets.state import Array, TimeArray
-from .steps import Steps, steps_of
+from .quantisation import Quantisation, quantisation_of
 
 DEGREE = np.pi / 180
+"""rad."""
 XYZ, ENU = ("x", "y", "z"), ("east", "north", "up")
 
 
@@ -22,16 +23,16 @@ class Channel:
     """One quantity of one stream.
 
     Attributes:
-        stream: as the description calls it: "imu", "dvl".
+        stream: its name in log.yaml: "imu", "dvl".
         name: "gyro", "accel", and otherwise the stream's.
         quantity: the key of log.yaml that names its columns: "gyro", "velocity", "depth".
         t_ns: (n,)
-        x: (n, k) what was read, SI, in the axes of the log; angles without their jumps of a turn.
-        sigma: (k,) what the log states of one reading: the median over its rows, inf where it was not measured.
-        unit: in which figures are told.
-        shown: how many of these one SI unit is.
+        x: (n, k) values, SI, in the axes of the log; angles unwrapped.
+        sigma: (k,) stated sigma of one reading: the median over its rows, inf where it was not measured.
+        unit: of printed figures.
+        shown: printed figure per SI unit.
         axes: (k,) names.
-        turn: what a full turn adds to x, 0 where the quantity is no angle.
+        turn: 2π for an angle, else 0.
     """
 
     stream: str
@@ -56,16 +57,16 @@ class Channel:
         return self.x - self.turn * np.rint(self.x / self.turn) if self.turn else self.x
 
     @cached_property
-    def steps(self) -> list[Steps]:
-        """How finely each axis is told."""
-        return [steps_of(axis) for axis in self.raw.T]
+    def steps(self) -> list[Quantisation]:
+        """The resolution of each axis."""
+        return [quantisation_of(axis) for axis in self.raw.T]
 
     def rows(self, chosen: NDArray[np.bool_]) -> Channel:
-        """Return the channel of some of its rows."""
+        """Return the channel with only some of its rows."""
         return replace(self, t_ns=self.t_ns[chosen], x=self.x[chosen])
 
-    def told(self, value: float) -> str:
-        """Return an SI value in the channel's unit."""
+    def text(self, value: float) -> str:
+        """Return an SI value as text, in the channel's unit."""
         return f"{value * self.shown:.3g} {self.unit}"
 
     def of_axis(self, axis: int) -> str:
@@ -99,7 +100,7 @@ def _aiding(name: str, stream: ReadingStream) -> Channel:
 
 
 def _turned(stream: AttitudeStream) -> Array:
-    """Return (n, 3) rad: the sum of the turns from one attitude to the next, in the sensor's axes."""
+    """Return (n, 3) rad: the sum of the rotations from one attitude to the next, in the sensor's axes."""
     R_WH = stream.z.reshape(-1, 3, 3)
     steps = Rotation.from_matrix(R_WH[:-1].transpose(0, 2, 1) @ R_WH[1:]).as_rotvec().reshape(-1, 3)
     return np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])

@@ -1,4 +1,4 @@
-"""The IMU's noise against what the rig states: by Allan deviation at rest, else from sample to sample."""
+"""The IMU's noise against the stated one: by Allan deviation at rest, else from sample to sample."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from ..findings.look import AXIS_COLOURS
+from ..findings.panels import AXIS_COLOURS
 from .allan import AllanCurve, allan_deviation, bias_instability, white_density
 from .channels import Channel, channels_of
 from .neighbours import noise_sigma
@@ -23,13 +23,14 @@ if TYPE_CHECKING:
 SHORTEST_REST_S = 30.0
 """A curve to τ = 3 s, past the second at which the density is read."""
 OFF = 3.0
-"""Factor between stated and found noise that is worth a word: a filter takes it for nine times the variance."""
+"""Ratio of stated and found noise that makes a finding: nine times the variance."""
 FILTERED_SAMPLES = 4
+"""Neighbouring samples that the sensor's own filter may correlate: usual are two to four."""
 UNIT = {"gyro": "rad/s/√Hz", "accel": "m/s²/√Hz"}
 
 
 def check_imu_noise(log: Log) -> Check:
-    """Compare the stated white densities with those of the longest stretch at rest, else with the scatter under way."""
+    """Compare the stated white densities with those of the longest time at rest, else with the scatter in motion."""
     gyro, accel = channels_of(log)[:2]
     found = rests(log)
     longest = max(found, key=lambda rest: rest.last - rest.first) if found else None
@@ -50,11 +51,11 @@ def check_imu_noise(log: Log) -> Check:
             bound = _bound(curve, channel.period_s)
             facts[channel.name] = (
                 f"{_listed(densities)} {UNIT[channel.name]} from sample to sample, at most {_listed(bound)} by the "
-                f"curve, under way (no {SHORTEST_REST_S:g} s at rest: motion is in it); stated {stated:.3g}"
+                f"curve, in motion (no {SHORTEST_REST_S:g} s at rest); stated {stated:.3g}"
             )
             findings += _under_way(channel, densities, bound, stated)
         curves[channel.name] = (curve, stated)
-    where = "at rest" if rest_s >= SHORTEST_REST_S else "under way: motion is in it"
+    where = "at rest" if rest_s >= SHORTEST_REST_S else "in motion, which it includes"
     return Check("noise of the IMU", facts, tuple(findings), _panel(curves, where))
 
 
@@ -70,24 +71,24 @@ def _at_rest(channel: Channel, densities: Array, stated: float) -> list[Finding]
     largest = float(densities.max())
     if not np.isfinite(largest) or largest == 0 or stated / OFF <= largest <= stated * OFF:
         return []
-    says = (
+    message = (
         f"At rest the {channel.name}'s white noise is {largest:.2g} {UNIT[channel.name]} on its worst axis, "
         f"{_beside(largest, stated)}."
     )
-    return [Finding("imu", says, f"streams.imu.noise.{channel.name}_density: {largest:.2g}")]
+    return [Finding("imu", message, f"streams.imu.noise.{channel.name}_density: {largest:.2g}")]
 
 
 def _beside(found: float, stated: float) -> str:
     if stated == 0:
         return "where none is stated"
     how = f"{found / stated:.1f} times" if found > stated else f"1/{stated / found:.3g} of"
-    return f"{how} what is stated ({stated:.2g})"
+    return f"{how} the stated one ({stated:.2g})"
 
 
 def _bound(curve: AllanCurve, period_s: float) -> Array:
-    """Return (k,) what no white density exceeds: the least σ √τ within a second; motion only adds to it.
+    """Return (k,) an upper bound on the white density: the least σ √τ within a second, since motion only adds.
 
-    The first few samples are left out, for a sensor's own filter makes neighbours alike.
+    The first few samples are left out, because a sensor's own filter correlates neighbours.
     """
     inside = (curve.tau_s > FILTERED_SAMPLES * period_s) & (curve.tau_s <= max(1.0, 2 * FILTERED_SAMPLES * period_s))
     if not inside.any():
@@ -98,19 +99,19 @@ def _bound(curve: AllanCurve, period_s: float) -> Array:
 def _under_way(channel: Channel, densities: Array, bound: Array, stated: float) -> list[Finding]:
     largest, most, unit = float(densities.max()), float(bound.max()), UNIT[channel.name]
     if largest > OFF * stated:
-        says = (
+        message = (
             f"From sample to sample the {channel.name} scatters like white noise of {largest:.2g} {unit}, "
-            f"{_beside(largest, stated)}: noise, or shaking that a filter must take for it."
+            f"{_beside(largest, stated)}: noise, or vibration that a filter must treat as noise."
         )
-        return [Finding("imu", says, f"streams.imu.noise.{channel.name}_density: {largest:.2g}")]
+        return [Finding("imu", message, f"streams.imu.noise.{channel.name}_density: {largest:.2g}")]
     if 0 < max(most, largest) < stated / OFF:
         most = most or largest
-        says = (
-            f"Even with all motion in it, the {channel.name} varies no more than white noise of {most:.2g} {unit} "
-            f"does, {_beside(most, stated)}."
+        message = (
+            f"Even with all motion in it, the {channel.name} varies no more than white noise of {most:.2g} {unit}, "
+            f"{_beside(most, stated)}."
         )
         return [
-            Finding("imu", says, f"streams.imu.noise.{channel.name}_density: {most:.2g}, unless it is large on purpose")
+            Finding("imu", message, f"streams.imu.noise.{channel.name}_density: {most:.2g}, unless inflated on purpose")
         ]
     return []
 

@@ -1,7 +1,7 @@
-"""What a reading has that its neighbours have not: noise, and now and then an outlier.
+"""A reading against its neighbours: noise and outliers, without a model of the motion.
 
-A cubic laid through the two readings before and the two after says what the one between should be. What is left has
-no motion in it that is slow against five readings, and (1 + 34/36) times the variance of white noise.
+A cubic through the two readings before and the two after predicts the one between. The residual contains no motion that
+is slow compared with five readings. For white noise its variance is (1 + 34/36) times that of a reading.
 """
 
 from __future__ import annotations
@@ -13,20 +13,23 @@ from ....datasets.state import Array, TimeArray
 from .channels import Channel
 
 MAD_TO_SIGMA = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation: 1 / Φ⁻¹(3/4)."""
 NOISE_GAIN = np.sqrt(1 + 34 / 36)
-"""Standard deviation of the residual over that of the readings, where their noise is white and normal."""
+"""Standard deviation of the residual over that of the readings, for white normal noise."""
 BLOCK = 100
+"""Rows over which the spread is taken to be constant: its robust sigma is then known to 12 %."""
 FEWEST = 20
-"""Residuals below which nothing is said of their spread."""
+"""Residuals: with fewer no spread is estimated."""
 FAR = 7.0
-"""Robust sigmas beyond which a reading is none of the noise: normal noise gets there once in 4e11."""
+"""In robust sigmas: a reading beyond this is an outlier; normal noise exceeds it once in 4e11."""
 FAR_FROM_CUBIC = 4.0
+"""In robust sigmas from the cubic: the second condition on an outlier, since a cubic follows motion closely."""
 STATED_FAR = 3.0
-"""An outlier within this many stated sigma is one that the stated noise explains."""
+"""In stated sigmas: within this the stated noise explains an outlier."""
 
 
 def robust_sigma(values: Array) -> Array:
-    """Return 1.4826 × the median distance from the median, by columns; NaN rows are passed over."""
+    """Return 1.4826 × the median absolute deviation, by columns; rows with NaN are ignored."""
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) < FEWEST:
         return np.full(values.shape[1], np.nan)
@@ -34,7 +37,7 @@ def robust_sigma(values: Array) -> Array:
 
 
 def residuals(channel: Channel) -> Array:
-    """Return (n, k): reading less cubic through its four neighbours; NaN where one of them is missing."""
+    """Return (n, k): reading less the cubic through its four neighbours; NaN where one of them is missing."""
     x, t_ns, out = channel.x, channel.t_ns, np.full(channel.x.shape, np.nan)
     if len(x) >= 5:
         whole = (t_ns[4:] - t_ns[:-4]) * 1e-9 < 5.0 * channel.period_s
@@ -43,21 +46,21 @@ def residuals(channel: Channel) -> Array:
 
 
 def noise_sigma(channel: Channel) -> Array:
-    """Return (k,) the standard deviation of the channel's white noise, out of its own values."""
+    """Return (k,) the standard deviation of the channel's white noise, estimated from its values."""
     return robust_sigma(residuals(channel)) / NOISE_GAIN
 
 
 def rounding_sigma(channel: Channel) -> Array:
-    """Return (k,) the standard deviation of the error by the steps that the values come in; 0 where there are none."""
+    """Return (k,) the standard deviation of the rounding error, step / √12; 0 for an axis without steps."""
     return np.array([steps.quantum for steps in channel.steps]) / np.sqrt(12)
 
 
 def outliers(channel: Channel) -> NDArray[np.bool_]:
-    """Return which readings (n,) stand out of their neighbours on some measured axis.
+    """Return which readings (n,) are outliers among their neighbours on some measured axis.
 
-    A reading must be far from the median of its four neighbours by the usual spread, far from the cubic through them
-    (or it is motion), and by more than the log states. For the IMU the usual spread is that thereabouts: it shakes now
-    more, now less. An aiding sensor that is noisier for a while is wrong for a while.
+    A reading must be far from the median of its four neighbours, far from the cubic through them (else it is motion),
+    and further than the stated noise explains. For the IMU the spread is the local one, because vibration varies. For
+    an aiding sensor it is that of the whole log: a noisy time is an error too.
     """
     x, none = channel.x, np.zeros(len(channel.x), bool)
     off = residuals(channel)
@@ -77,7 +80,7 @@ def outliers(channel: Channel) -> NDArray[np.bool_]:
 
 
 def spread_by_block(values: Array) -> tuple[TimeArray, Array]:
-    """Return where blocks of about 100 rows begin and the last ends (b + 1,), and the robust sigma of each (b, k)."""
+    """Return the edges (b + 1,) of blocks of about 100 rows, and the robust sigma of each (b, k)."""
     blocks = max(len(values) // BLOCK, 1)
     edges = np.linspace(0, len(values), blocks + 1).astype(np.int64)
     longest = int(np.diff(edges).max())
@@ -89,7 +92,7 @@ def spread_by_block(values: Array) -> tuple[TimeArray, Array]:
 
 
 def _nan_median(values: Array) -> Array:
-    """Return the medians (b, k) of values (b, m, k), NaN passed over; numpy's own takes a Python call for each."""
+    """Return the medians (b, k) of values (b, m, k) without NaN; numpy's own makes a Python call for each."""
     count = np.isfinite(values).sum(axis=1, keepdims=True)
     ordered = np.sort(values, axis=1)  # NaN last
     middle = [np.take_along_axis(ordered, np.maximum((count - less) // 2, 0), axis=1) for less in (0, 1)]
@@ -97,7 +100,7 @@ def _nan_median(values: Array) -> Array:
 
 
 def _spread_thereabouts(values: Array) -> Array:
-    """Return (n, k): the robust sigma of a row's block, of the two beside it, or of all, whichever is largest."""
+    """Return (n, k): the largest of the robust sigmas of a row's block, of the two next to it, and of all rows."""
     edges, spread = spread_by_block(values)
     overall = robust_sigma(values)
     spread = np.where(np.isfinite(spread), spread, overall)

@@ -1,4 +1,4 @@
-"""The noise of the aiding sensors, out of their own values, against what the log states."""
+"""The noise of the aiding sensors, estimated from their values, against the stated sigma."""
 
 from __future__ import annotations
 
@@ -10,23 +10,25 @@ from numpy.typing import NDArray
 from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from ..findings.look import colour_of
+from ..findings.panels import colour_of
 from .channels import Channel, channels_of
+from .missing import readings_of
 from .neighbours import noise_sigma, residuals, rounding_sigma, spread_by_block
-from .unread import readings_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 OFF = 3.0
-"""Factor between stated and found sigma that is worth a word: nine in the weight of a reading."""
+"""Ratio of stated and found sigma that makes a finding: a factor of nine in the weight of a reading."""
 
 UNSURE = 1.65
-"""Relative error of a robust sigma of n residuals, times √n: 1.17, and √2 more as neighbours share readings."""
+"""Relative error of a robust sigma of n residuals, times √n: 1.17, times √2 because neighbours share readings."""
 MOVING = 2.0
-"""How much larger the scatter of every second reading must be to be of motion: it holds up to 16 times more of that."""
+"""Ratio of the scatter of every second reading to that of all; above it the scatter contains motion, which grows up to
+16 times."""
 NOISIER, NOISY_SHARE, FEWEST_BLOCKS = 2.0, 0.05, 10
-"""A robust sigma of a hundred residuals is known to 12 %: twice the usual is eight of its own sigmas away."""
+"""Ratio to the usual sigma, least share of the log, and least number of blocks. A robust sigma of a hundred residuals
+is known to 12 %, so twice the usual is eight of its own sigmas away."""
 
 
 def check_noise(log: Log) -> Check:
@@ -43,7 +45,7 @@ def check_noise(log: Log) -> Check:
         moving = _every_second(channel) > MOVING * sigma
         alive = measured & (np.ptp(channel.x, axis=0) > 0)
         facts[channel.name] = "; ".join(
-            f"{channel.of_axis(k)} {floor[k] * channel.shown:.2g}, stated {channel.told(float(stated[k]))}"
+            f"{channel.of_axis(k)} {floor[k] * channel.shown:.2g}, stated {channel.text(float(stated[k]))}"
             + (" (motion is in it)" if moving[k] else "")
             for k in np.flatnonzero(measured).tolist()
         )
@@ -70,12 +72,12 @@ def check_noise(log: Log) -> Check:
 
 
 def _every_second(channel: Channel) -> Array:
-    """Return the scatter (k,) of every second reading: that of white noise is the same, that of motion much larger."""
+    """Return the scatter (k,) of every second reading: the same for white noise, much larger for motion."""
     return noise_sigma(channel.rows(np.arange(len(channel.x)) % 2 == 0))
 
 
 def _changing(log: Log, channel: Channel, measured: NDArray[np.bool_], rounding: Array) -> list[Finding]:
-    """Find a sensor that is much noisier for a good part of the log than usually."""
+    """Find a sensor that is much noisier than usual for part of the log."""
     edges, spread = spread_by_block(residuals(channel))
     spread = np.maximum(spread, rounding)[:, measured]
     usual = np.median(spread[np.isfinite(spread).all(axis=1)], axis=0)
@@ -90,17 +92,17 @@ def _changing(log: Log, channel: Channel, measured: NDArray[np.bool_], rounding:
     begin_s, end_s = (
         (int(channel.t_ns[row]) - log.start_ns) * 1e-9 for row in (int(edges[first]), int(edges[last]) - 1)
     )
-    says = (
+    message = (
         f"{channel.name} is {np.median(times[noisy]):.1f} times as noisy as usual in {noisy.mean():.0%} of the log, "
-        f"longest from {begin_s:.0f} to {end_s:.0f} s: one sigma cannot be right for all of it."
+        f"longest from {begin_s:.0f} to {end_s:.0f} s: no single sigma is right for all of it."
     )
     path = f"streams.{channel.stream}"
-    mend = f"{path}.sigma (columns, row by row), or {path}.outliers.above"
-    return [Finding(channel.stream, says, mend)]
+    fix = f"{path}.sigma (columns, row by row), or {path}.outliers.above"
+    return [Finding(channel.stream, message, fix)]
 
 
 def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
-    """Tell of the axis that is farthest off."""
+    """Return the finding about the axis whose ratio is farthest from 1."""
     with np.errstate(divide="ignore"):
         off = np.where(np.isfinite(ratio) & (ratio > 0), np.abs(np.log(ratio)), 0.0)
     k = int(np.argmax(off))
@@ -109,14 +111,14 @@ def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
         return []
     large = ratio[k] > 1
     how = f"{ratio[k]:.1f} times" if large else f"1/{1 / ratio[k]:.3g} of"
-    says = (
-        f"{channel.of_axis(k)} scatters from reading to reading by {channel.told(float(found[k]))}, {how} the sigma "
-        f"that is stated ({channel.told(float(channel.sigma[k]))})."
+    message = (
+        f"{channel.of_axis(k)} scatters from reading to reading by {channel.text(float(found[k]))}, {how} the stated "
+        f"sigma ({channel.text(float(channel.sigma[k]))})."
     )
     key = {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(channel.stream, "sigma_m")
     values = [f"{found[j] * channel.shown:.2g}" if np.isfinite(channel.sigma[j]) else ".inf" for j in range(len(found))]
-    mend = f"streams.{channel.stream}.{key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
+    fix = f"streams.{channel.stream}.{key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
     if not large:
-        says += " Right only if most of its error is slow, which does not show here."
-        mend += ", if its errors are white"
-    return [Finding(channel.stream, says, mend)]
+        message += " The stated one is right only if most of the error is slow, which this check cannot see."
+        fix += ", if its errors are white"
+    return [Finding(channel.stream, message, fix)]

@@ -1,4 +1,4 @@
-"""What gravity says of the IMU: units, axes, mounting, and whether gyro and accelerometer turn together."""
+"""The IMU against gravity: units, axes, mounting, and whether gyro and accelerometer turn together."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ....datasets.log import Log
 from ....datasets.rig import Rig
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from ..findings.look import AXIS_COLOURS, thinned
+from ..findings.panels import AXIS_COLOURS, thinned
 from .channels import DEGREE
 from .neighbours import robust_sigma
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 G = 9.80665
+"""m/s²: standard gravity."""
 MISREAD = {
     1 / G: ("g", "unit: g"),
     1e3 / G: ("mg", "unit: mg"),
@@ -28,37 +29,42 @@ MISREAD = {
     1e2: ("cm/s²", "{unit: m/s^2, scale: 0.01}"),
     1 / 0.3048: ("ft/s²", "{unit: m/s^2, scale: 0.3048}"),
 }
-"""|f| over gravity, for units mistaken for one another: in which it is, and what log.yaml should say of it."""
+"""|f| over gravity, if a unit is read as another: the true unit, and the key for log.yaml."""
 UNIT_TOLERANCE = 0.1
+"""Relative: the neighbouring ratios are 10 and 3.3 times apart, and a bias of 1 m/s² still fits."""
 NO_GRAVITY = 0.2
-"""Of gravity: a mean |f| below it has had gravity taken out."""
+"""Of gravity: below this mean |f|, gravity was removed from the data."""
 GRAVITY_UNSURE = 0.03
-"""m/s²: half of what gravity varies by over the globe, where a log takes a round figure for it."""
+"""m/s²: half of gravity's variation over the globe, since many logs state a round figure."""
 LEVEL_OVER_UPRIGHT = 10.0
-"""Variance of the level accelerations over that of the upright one, which is what |f| shows; at sea it is about two."""
+"""Variance of the level accelerations over that of the vertical one, which |f| shows; at sea it is about two."""
 UNKNOWN_SPEED_M_S = 2.0
+"""Assumed without a DVL: a usual speed of an underwater vehicle."""
 SIGMAS = 4.0
+"""Of the stated accelerometer bias: normal biases exceed it once in 16,000."""
 TILTED_DEG = 20.0
 """No vehicle travels with its nose or a side so far down on average."""
 SQUARE_DEG = 20.0
-"""Mountings come at right angles: a tilt so near one is taken for it."""
+"""Mountings are usually at right angles: a tilt this near to one is taken for it."""
 BLOCK_S = 0.5
+"""Means over this: vibration averages out, and a vehicle still tilts within it."""
 TOGETHER = 0.5
-"""Correlation between what gyro and accelerometer say of tilting, from which on its size is believed."""
+"""Least correlation between the tilting by gyro and by accelerometer for the slope to be used."""
 FASTEST_RAD_S = 10.0
-"""570 °/s: no vehicle with people's instruments aboard turns so."""
+"""570 °/s: faster than any underwater vehicle, ship or car turns."""
 LONGEST_GAP_S = 0.2
+"""Longer gaps between two means are skipped: the rate between is not known."""
 
 
 class Tilting(NamedTuple):
-    """How the turning of f agrees with the gyro's: f changes by slope × what the gyro says, with this correlation."""
+    """Regression of the change of f on the change that the gyro predicts: its slope and correlation."""
 
     slope: float
     correlation: float
 
 
 def check_norms(log: Log) -> Check:
-    """Compare the mean specific force with gravity, and its turning with the gyro's."""
+    """Compare the mean specific force with gravity, and its rotation with the gyro's."""
     f_I, rig = log.imu.f_I, log.rig
     norm = np.linalg.norm(f_I, axis=1)
     mean_f_B = np.median(f_I, axis=0) @ rig.imu.R_BS.T
@@ -90,11 +96,11 @@ def check_norms(log: Log) -> Check:
 
 
 def _misread(size: float, gravity: float) -> list[Finding]:
-    """Find a specific force in another unit than the one stated."""
-    for factor, (unit, mend) in MISREAD.items():
+    """Find a specific force in a unit other than the stated one."""
+    for factor, (unit, fix) in MISREAD.items():
         if abs(size / gravity / factor - 1) < UNIT_TOLERANCE:
-            says = f"The specific force is {size:.4g} m/s² strong where gravity is {gravity:.4g}: it is in {unit}."
-            return [Finding("imu", says, f"streams.imu.accel{': ' if mend[0] == '{' else '.'}{mend}")]
+            message = f"The specific force is {size:.4g} m/s² strong where gravity is {gravity:.4g}: it is in {unit}."
+            return [Finding("imu", message, f"streams.imu.accel{': ' if fix[0] == '{' else '.'}{fix}")]
     return []
 
 
@@ -102,20 +108,24 @@ def _strength(log: Log, norm: Array) -> list[Finding]:
     """Find a mean |f| that neither gravity, nor bias, nor the vehicle's own acceleration explains."""
     gravity, size = log.rig.gravity, float(np.median(norm))
     if size < NO_GRAVITY * gravity:
-        says = f"The specific force is {size:.3g} m/s² strong: gravity has been taken out of it."
-        return [Finding("imu", says, "streams.imu.accel.columns: those of the raw specific force")]
+        message = f"The specific force is {size:.3g} m/s² strong: gravity was removed from it."
+        return [Finding("imu", message, "streams.imu.accel.columns: those of the raw specific force")]
     spread = float(robust_sigma(norm[:, None])[0])
     turning = float(np.mean(np.sum(log.imu.w_WI_I**2, axis=1))) * _speed(log) ** 2
-    moving = (LEVEL_OVER_UPRIGHT * spread**2 + turning) / (2 * gravity)  # what accelerations square to gravity add
+    moving = (LEVEL_OVER_UPRIGHT * spread**2 + turning) / (
+        2 * gravity
+    )  # added by accelerations perpendicular to gravity
     allowed = GRAVITY_UNSURE + SIGMAS * log.rig.imu_noise.accel_bias_sigma + moving
     if abs(size - gravity) <= allowed:
         return []
-    says = (
+    message = (
         f"The specific force is {size:.4f} m/s² strong where gravity is {gravity:.4f}: off by {size - gravity:+.3f}, "
         "and "
         f"bias ({SIGMAS:g} × {log.rig.imu_noise.accel_bias_sigma:.2g}) and motion explain {allowed:.2g}. Scale or bias."
     )
-    return [Finding("imu", says, f"streams.imu.accel.scale: {gravity / size:.4f} (times the one there), or its offset")]
+    return [
+        Finding("imu", message, f"streams.imu.accel.scale: {gravity / size:.4f} (times the one there), or its offset")
+    ]
 
 
 def _speed(log: Log) -> float:
@@ -132,28 +142,28 @@ def _upright(rig: Rig, f_I: Array, size: float) -> list[Finding]:
     if length < NO_GRAVITY * size or size == 0 or tilt_deg <= TILTED_DEG:
         return []
     if 180 - tilt_deg < SQUARE_DEG:
-        says = "The specific force points down in the body (mean f along −z): z is down in these axes, not up."
-        mend = "streams.imu.axes: FRD (FLU, if it says FRD already); or mounting: {roll_deg: 180}"
-        return [Finding("imu", says, mend)]
+        message = "The specific force points down in the body (mean f along −z): z is down in these axes, not up."
+        fix = "streams.imu.axes: FRD (FLU, if it says FRD already); or mounting: {roll_deg: 180}"
+        return [Finding("imu", message, fix)]
     R_BI, square = levelled(rig.imu.R_BS, f_B / length)
     yaw, pitch, roll = Rotation.from_matrix(R_BI).as_euler("ZYX", degrees=True) + 0.0
     axis = int(np.argmax(np.abs(f_I)))
-    says = (
+    message = (
         f"The specific force points {tilt_deg:.0f}° off the body's z axis; in the IMU's own axes up is "
         f"{'−' if f_I[axis] < 0 else '+'}{'xyz'[axis]}."
-        + ("" if square else " That is no right angle: a tilted mounting, or a vehicle that is not level on average.")
+        + ("" if square else " It is not a right angle: a tilted mounting, or a vehicle not level on average.")
     )
-    mend = (
+    fix = (
         f"streams.imu.mounting: {{roll_deg: {roll:.4g}, pitch_deg: {pitch:.4g}, yaw_deg: {yaw:.4g}}}; gravity does not "
         "show the yaw, so add the one that turns the gyro's axes the vehicle's way"
     )
-    return [Finding("imu", says, mend)]
+    return [Finding("imu", message, fix)]
 
 
 def levelled(R_BI: Array, up_B: Array) -> tuple[Array, bool]:
-    """Return the mounting that differs least from R_BI and makes up_B (3,) up; and whether it is at right angles to it.
+    """Return the mounting nearest to R_BI that makes up_B (3,) up, and whether the correction is by right angles.
 
-    Where up is near an axis of the body, it is taken to be that axis.
+    An up that is near an axis of the body is taken to be that axis.
     """
     axis = int(np.argmax(np.abs(up_B)))
     square = bool(abs(up_B[axis]) > np.cos(SQUARE_DEG * DEGREE))
@@ -168,10 +178,10 @@ def levelled(R_BI: Array, up_B: Array) -> tuple[Array, bool]:
 
 
 def gyro_against_gravity(log: Log) -> Tilting:
-    """Compare the turning of f with the gyro's, by means over half a second: df = −∫w dt × f where nothing accelerates.
+    """Compare the rotation of f with the gyro's, by means over half a second: df = −∫w dt × f without acceleration.
 
-    Units, a common turn of both sensors' axes, and a sign of f leave no doubt in it: 1 where all is well, 1/57 where
-    degrees are taken for radians. Accelerations are noise to it, hence the correlation.
+    The slope is 1 if all is well, and 1/57 if degrees are read as radians. A rotation of both sensors' axes, the unit
+    of f and its sign do not change it. Accelerations act as noise, hence the correlation.
     """
     t_ns, period_ns = log.imu.t_ns, log.imu.period_ns
     size = max(round(BLOCK_S * 1e9 / period_ns), 1)
@@ -182,9 +192,9 @@ def gyro_against_gravity(log: Log) -> Tilting:
     step_s = np.diff(t_ns[:n].reshape(-1, size).mean(axis=1)) * 1e-9
     whole = step_s < size * period_ns * 1e-9 + LONGEST_GAP_S
     turned = 0.5 * (w[1:] + w[:-1]) * step_s[:, None]
-    says_gyro = -np.cross(turned, 0.5 * (f[1:] + f[:-1]))[whole]
-    says_f = np.diff(f, axis=0)[whole]
-    both, gyro, accel = (float(np.sum(a * b)) for a, b in ((says_gyro, says_f), (says_gyro,) * 2, (says_f,) * 2))
+    by_gyro = -np.cross(turned, 0.5 * (f[1:] + f[:-1]))[whole]
+    by_f = np.diff(f, axis=0)[whole]
+    both, gyro, accel = (float(np.sum(a * b)) for a, b in ((by_gyro, by_f), (by_gyro,) * 2, (by_f,) * 2))
     if gyro == 0 or accel == 0:
         return Tilting(float("nan"), 0.0)
     return Tilting(both / gyro, both / np.sqrt(gyro * accel))
@@ -194,19 +204,19 @@ def _rates(rate: float, tilting: Tilting) -> list[Finding]:
     """Find rates in the wrong unit or of the wrong sign."""
     in_degrees = "streams.imu.gyro.unit: deg/s"
     if tilting.correlation > TOGETHER and 0.5 < tilting.slope / DEGREE < 2:
-        says = f"f tilts by {tilting.slope:.3f} of what the gyro says, about 1/57: degrees are read as radians."
-        return [Finding("imu", says, in_degrees)]
+        message = f"f tilts by {tilting.slope:.3f} of the gyro's rotation, about 1/57: degrees are read as radians."
+        return [Finding("imu", message, in_degrees)]
     if tilting.correlation > TOGETHER and 0.5 < tilting.slope * DEGREE < 2:
-        says = f"f tilts by {tilting.slope:.3g} times what the gyro says, about 57: radians are read as degrees."
-        return [Finding("imu", says, "streams.imu.gyro.unit: rad/s")]
+        message = f"f tilts by {tilting.slope:.3g} times the gyro's rotation, about 57: radians are read as degrees."
+        return [Finding("imu", message, "streams.imu.gyro.unit: rad/s")]
     if tilting.correlation < -TOGETHER:
-        says = "f tilts against the gyro (correlation {:.2f}): the gyro's sign or axes differ from the accelerometer's."
-        mend = "streams.imu.gyro.scale: −1, or both sensors' columns in the same order and axes"
-        return [Finding("imu", says.format(tilting.correlation), mend)]
+        message = "f tilts against the gyro (correlation {:.2f}): sign or axes of gyro and accelerometer differ."
+        fix = "streams.imu.gyro.scale: −1, or both sensors' columns in the same order and axes"
+        return [Finding("imu", message.format(tilting.correlation), fix)]
     if rate > FASTEST_RAD_S:
         return [
             Finding(
-                "imu", f"The gyro reads over {rate:.3g} rad/s for 1 % of the time: no vehicle turns so.", in_degrees
+                "imu", f"The gyro reads over {rate:.3g} rad/s for 1 % of the time, which no vehicle does.", in_degrees
             )
         ]
     return []

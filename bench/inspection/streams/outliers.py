@@ -1,4 +1,4 @@
-"""Readings that stand out of their neighbours."""
+"""Outliers: readings far from their neighbours."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ....datasets.log import Log
 from ....datasets.state import TimeArray
 from ..findings.finding import Check, Finding
-from ..findings.look import AXIS_COLOURS, thinned
+from ..findings.panels import AXIS_COLOURS, thinned
 from .channels import Channel, channels_of
+from .missing import missing_rows, readings_of
 from .neighbours import FAR, outliers, residuals, robust_sigma, rounding_sigma
-from .unread import readings_of, unread_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WEIGHTY = 0.1
-"""Of the stated variance, summed over all readings: what outliers must add to it to matter to an estimate."""
+"""Of the stated variance, summed over all readings: outliers that add less do not change an estimate."""
 CLEARLY = 0.5
-"""Share of the outliers that a bound on the size must catch to be worth proposing."""
+"""Share of the outliers that a bound on the size must catch to be proposed."""
 SPARED = 0.999
+"""Share of the good readings that such a bound must leave in."""
 
 
 Marked = tuple[Channel, NDArray[np.bool_], TimeArray]
@@ -32,12 +33,12 @@ Marked = tuple[Channel, NDArray[np.bool_], TimeArray]
 
 
 def check_outliers(log: Log) -> Check:
-    """Count the readings of every channel that stand out of their neighbours."""
+    """Count the outliers of every channel."""
     facts, findings, found = {}, [], {}
     for whole in channels_of(log):
         channel = readings_of(whole)
         out = outliers(channel)
-        found[channel.name] = (channel, out, whole.t_ns[~unread_rows(whole).readings])
+        found[channel.name] = (channel, out, whole.t_ns[~missing_rows(whole).readings])
         count = int(out.sum())
         facts[channel.name] = f"{count} of {len(out)} ({count / len(out):.2%})"
         if _added(channel, out) > WEIGHTY:
@@ -46,7 +47,7 @@ def check_outliers(log: Log) -> Check:
 
 
 def _added(channel: Channel, out: NDArray[np.bool_]) -> float:
-    """Return what the outliers add to the variance of the readings' sum, over what all readings are stated to."""
+    """Return the variance that the outliers add to the sum of the readings, over the stated variance of all."""
     if not out.any():
         return 0.0
     added = np.sum(residuals(channel)[out] ** 2, axis=0) / len(out)
@@ -58,29 +59,28 @@ def _finding(channel: Channel, out: NDArray[np.bool_]) -> Finding:
     spread = np.maximum(robust_sigma(off), rounding_sigma(channel))
     worst = np.abs(off[out]).max(axis=0)
     k = int(np.nanargmax(worst / np.where(np.isfinite(channel.sigma) & (spread > 0), spread, np.nan)))
-    says = (
+    message = (
         f"{int(out.sum())} of {len(out)} {channel.name} readings ({out.mean():.2%}) stand out of their neighbours by "
-        "more "
-        f"than {FAR:g} times their usual spread; the farthest by {channel.told(float(worst[k]))}, where the spread is "
-        f"{channel.told(float(spread[k]))}."
+        f"more than {FAR:g} times the usual spread; the farthest by {channel.text(float(worst[k]))}, where the spread "
+        f"is {channel.text(float(spread[k]))}."
     )
     size = np.linalg.norm(channel.raw[:, np.isfinite(channel.sigma)], axis=1)
     above = float(f"{1.1 * np.quantile(size[~out], SPARED):.2g}")
     caught = float(np.mean(size[out] > above))
     if channel.stream != "imu" and caught >= CLEARLY:
-        mend = f"streams.{channel.stream}.outliers.above: {above:g} (drops {caught:.0%} of them)"
-        return Finding(channel.stream, says, mend)
+        fix = f"streams.{channel.stream}.outliers.above: {above:g} (drops {caught:.0%} of them)"
+        return Finding(channel.stream, message, fix)
     return Finding(
-        channel.stream, says + " No bound on their size parts them from the rest: an estimator has to gate them."
+        channel.stream, message + " No bound on their size separates them from the rest: an estimator has to gate them."
     )
 
 
 def _panel(log: Log, found: dict[str, Marked]) -> Callable[[Axes], None] | None:
-    """Return a panel of the velocity, where there is a DVL; else of the stream with most outliers, if any has one."""
+    """Return a panel of the velocity if there is a DVL; else of the stream with most outliers, if any has one."""
     if "dvl" in found:
-        channel, out, unread_ns = found["dvl"]
+        channel, out, missing_ns = found["dvl"]
     else:
-        channel, out, unread_ns = max(found.values(), key=lambda marked: marked[1].mean())
+        channel, out, missing_ns = max(found.values(), key=lambda marked: marked[1].mean())
         if not out.any():
             return None
 
@@ -99,9 +99,9 @@ def _panel(log: Log, found: dict[str, Marked]) -> Callable[[Axes], None] | None:
             room = max(high - low, 1e-9)
             far_low, far_high = max(x.min(), low - room), min(x.max(), high + room)
             axes.set_ylim(min(low, far_low) - 0.2 * room, max(high, far_high) + 0.2 * room)
-        if len(unread_ns):
+        if len(missing_ns):
             at = {"transform": axes.get_xaxis_transform(), "color": "black", "ms": 8}
-            axes.plot((unread_ns - log.start_ns) * 1e-9, np.full(len(unread_ns), 0.02), "|", label="no reading", **at)
+            axes.plot((missing_ns - log.start_ns) * 1e-9, np.full(len(missing_ns), 0.02), "|", label="no reading", **at)
         axes.set(xlabel="time, s", ylabel=f"{channel.name}, {channel.unit}")
         axes.legend(fontsize=6, ncols=2)
 

@@ -1,4 +1,4 @@
-"""When readings come: rates, gaps, clusters, and how late."""
+"""The times of the readings: rates, gaps, bunches and delays."""
 
 from __future__ import annotations
 
@@ -11,26 +11,29 @@ from ....datasets.log import Log
 from ....datasets.state import Array, TimeArray
 from ...output.figures.drawing import logarithmic
 from ..findings.finding import Check, Finding
-from ..findings.look import colour_of, thinned
+from ..findings.panels import colour_of, thinned
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SLOWEST_IMU_HZ = 20.0
-"""A vehicle's own motion reaches 2 Hz (pitch and roll in a sea, a turn of the fins); ten samples a period show it."""
+"""A vehicle's own motion reaches 2 Hz (pitch and roll in a sea, a turn of the fins), with ten samples per period."""
 CLUSTERED = 0.25
-"""Of the median interval: what two samples of a clock are never apart."""
+"""Of the median interval: two samples stamped by a regular clock are never this close."""
 MOST_CLUSTERED = 0.01
+"""Share of the intervals: a few such pairs occur in any log, when a host catches up."""
 MOST_JITTER = 0.2
-"""Of the interval, as a standard deviation: a sample half of whose interval is guessed is no sample of a clock."""
+"""Standard deviation over the interval: with more, the stamps are not of the sampling."""
 MOST_LOST = {"imu": 0.001}
+"""Share of samples. A lost inertial sample is motion that was not measured."""
 MOST_LOST_AIDING = 0.05
-"""A lost reading of an aiding sensor is only a reading less; a lost inertial sample is motion that nobody saw."""
+"""Share of readings. A lost reading of an aiding sensor only means less information."""
 MOST_OUTSIDE = 0.01
+"""Share of readings outside the IMU's time: recorders rarely start and stop all streams at once."""
 LONGEST_GAP_S = 5.0
-"""Tilted by half a degree, which is what accelerometers level to, inertial dead reckoning is 1 m off after 5 s."""
+"""Tilted by half a degree, as accelerometers level, inertial dead reckoning is 1 m off after 5 s."""
 LONGEST_IMU_GAP_S = 0.1
-"""Turning at 10 °/s, the vehicle has turned by a degree that no gyro saw."""
+"""At 10 °/s the vehicle turns by a degree meanwhile."""
 
 
 def check_rates(log: Log) -> Check:
@@ -54,15 +57,15 @@ def check_rates(log: Log) -> Check:
         )
         mean_hz = (len(t_ns) - 1 + lost) / ((int(t_ns[-1]) - int(t_ns[0])) * 1e-9)
         bunched = _clusters(name, clustered, jitter, period_s, mean_hz)
-        findings += bunched or _gaps(log, name, t_ns, lost)  # bunches have gaps between them
+        findings += bunched or _gaps(log, name, t_ns, lost)  # bunches imply gaps between them
     imu_hz = 1e9 / log.imu.period_ns
     if imu_hz < SLOWEST_IMU_HZ:
         findings.append(
             Finding(
                 "imu",
-                f"The IMU gives {imu_hz:.3g} Hz: what moves or shakes faster than {imu_hz / 2:.3g} Hz is folded into "
-                "its samples, and coning between them is not seen.",
-                "streams.imu.noise.gyro_density and accel_density: large enough to hold that",
+                f"The IMU samples at {imu_hz:.3g} Hz: motion and vibration above {imu_hz / 2:.3g} Hz are aliased, and "
+                "coning between samples is not measured.",
+                "streams.imu.noise.gyro_density and accel_density: large enough to cover that",
             )
         )
 
@@ -87,7 +90,7 @@ def _times(log: Log) -> dict[str, TimeArray]:
 
 
 def _longest_gap_s(name: str, period_s: float) -> float:
-    """Return from where on a gap is a silence, and no number of lost readings."""
+    """Return the length from which a gap is a silence rather than lost readings."""
     return max(LONGEST_IMU_GAP_S if name == "imu" else LONGEST_GAP_S, 3 * period_s)
 
 
@@ -96,33 +99,33 @@ def _since(log: Log, t_ns: int) -> float:
 
 
 def _lost(name: str, interval_s: Array, period_s: float) -> int:
-    """Return how many readings are missing between silences; two in the time of one make up for a missing one."""
+    """Return the number of missing readings between silences; two within one period cancel a missing one."""
     short = interval_s[interval_s <= _longest_gap_s(name, period_s)]
     return max(int((np.rint(short / period_s) - 1).sum()), 0)
 
 
 def _clusters(name: str, clustered: float, jitter: float, period_s: float, mean_hz: float) -> list[Finding]:
     if clustered > MOST_CLUSTERED:
-        says = (
+        message = (
             f"{name} readings come in bunches: {clustered:.1%} of their intervals are under a quarter of the median "
             f"({period_s * 1e3:.3g} ms). They were stamped when they were received, not when they were taken."
         )
     elif name == "imu" and jitter > MOST_JITTER:
-        says = (
+        message = (
             f"IMU intervals jitter by {jitter:.0%} of {period_s * 1e3:.3g} ms: they were stamped when they were "
             "received, not when they were taken."
         )
     else:
         return []
-    mend = (
+    fix = (
         f"streams.{name}.message.clock, or a time column of the device's own clock; without one, "
         f"streams.{name}.time: {{row_rate_hz: {mean_hz:.5g}, start_s: …}} if no row is missing"
     )
-    return [Finding(name, says, mend)]
+    return [Finding(name, message, fix)]
 
 
 def _gaps(log: Log, name: str, t_ns: TimeArray, lost: int) -> list[Finding]:
-    """Find lost readings and long silences; a GPS is silent under water, so nothing is said of its gaps."""
+    """Find lost readings and long silences; a GPS is silent under water, so its gaps are no finding."""
     if name == "gps":
         return []
     findings = []
@@ -166,12 +169,12 @@ def _gaps(log: Log, name: str, t_ns: TimeArray, lost: int) -> list[Finding]:
 
 
 def check_delays(log: Log) -> Check:
-    """Say how long each stream's readings were on their way, and which overtook which."""
+    """Report how late each stream's readings were received, and how many out of order."""
     facts, findings = {}, []
     late = {name: np.asarray((s.received_ns - s.t_ns) * 1e-9, float) for name, s in log.streams.items() if len(s) > 1}
     for name, late_s in late.items():
         if not late_s.any():
-            facts[name] = "received when it was true, or nobody noted when"
+            facts[name] = "none, or not recorded"
             continue
         stream = log.streams[name]
         overtaken = int(
@@ -184,9 +187,9 @@ def check_delays(log: Log) -> Check:
             findings.append(
                 Finding(
                     name,
-                    f"{name} readings come {median_s:.3g} s after they were true (at most {late_s.max():.3g} s), their "
-                    f"interval being {period_s:.3g} s{order}: a filter that cannot go back uses them late.",
-                    f"streams.{name}.time.received and .delay_s, if this is not so",
+                    f"{name} readings arrive {median_s:.3g} s after they were true (at most {late_s.max():.3g} s), "
+                    f"with an interval of {period_s:.3g} s{order}: a filter that cannot replay uses them late.",
+                    f"streams.{name}.time.received and .delay_s, if that is wrong",
                 )
             )
 

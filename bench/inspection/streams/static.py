@@ -1,4 +1,4 @@
-"""Stretches in which the vehicle was at rest, and what the IMU says there."""
+"""Times at rest, and the gyro's bias and |f| in them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ....datasets.log import Log
 from ....datasets.rig import EARTH_RATE_RADPS
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
-from ..findings.look import AXIS_COLOURS, thinned
+from ..findings.panels import AXIS_COLOURS, thinned
 from .channels import DEGREE, channels_of
 from .neighbours import noise_sigma
 
@@ -19,29 +19,35 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 WINDOW_S = 1.0
+"""The rest test is made per window of this length."""
 PART_S = 0.1
+"""Means over this are compared within a window, so that noise and vibration average out."""
 QUIET_RAD_S = 0.005
-"""0.3 °/s, over tenths of a second within one second: a vehicle moored to a quay turns more."""
+"""0.3 °/s, as the standard deviation of such means: a vehicle moored to a quay turns more."""
 QUIET_M_S2 = 0.05
+"""The same for the specific force: 0.3° of tilt."""
 QUIET_M_S = 0.1
+"""By the DVL: slower than any vehicle under way."""
 TURNED_RAD = DEGREE
-"""From the first quarter of a stretch to its last."""
+"""From the first quarter of a time at rest to its last."""
 SHORTEST_S = 5.0
+"""Over less, a gyro's white noise hides the turn-on bias that is read there."""
 SIGMAS = 4.0
+"""Of the stated turn-on bias: normal biases exceed it once in 16,000."""
 
 
 class Rest(NamedTuple):
-    """One stretch at rest: samples first to last, both within."""
+    """One time at rest: samples `first` to `last`, inclusive."""
 
     first: int
     last: int
 
 
 def rests(log: Log) -> list[Rest]:
-    """Return the stretches of five seconds and more at rest, in order.
+    """Return the times of five seconds and more at rest, in order.
 
-    At rest are seconds in which gyro and accelerometer, averaged over tenths of a second, hardly vary (beyond what
-    their stated noise leaves in such means), the DVL hardly moves, and which agree with each other in rate and in f.
+    A second is at rest if gyro and accelerometer, averaged over tenths of a second, hardly vary (allowing for their
+    stated noise) and the DVL reads hardly any velocity. Seconds of one time at rest must agree in rate and in f.
     """
     t_ns, noise = log.imu.t_ns, log.rig.imu_noise
     part = max(round(PART_S * 1e9 / log.imu.period_ns), 1)
@@ -73,17 +79,17 @@ def rests(log: Log) -> list[Rest]:
                 turns.append(means[0][0][a : b + 1].mean(axis=0))
     if not found:
         return []
-    least = turns[int(np.argmin(np.linalg.norm(turns, axis=1)))]  # a steady turn looks like rest, but turns more
+    least = turns[int(np.argmin(np.linalg.norm(turns, axis=1)))]  # a steady turn passes as rest, but its rate is larger
     return [rest for rest, turn in zip(found, turns, strict=True) if np.abs(turn - least).max() <= means[0][1]]
 
 
 def _whole(t_ns: TimeArray, period_ns: int) -> NDArray[np.bool_]:
-    """Return which windows (rows) have no gap in them."""
+    """Return which windows (rows) have no gap."""
     return t_ns[:, -1] - t_ns[:, 0] < 1.5 * period_ns * t_ns.shape[1]
 
 
 def _still_by_dvl(log: Log, starts_ns: TimeArray, ends_ns: TimeArray) -> NDArray[np.bool_]:
-    """Return in which windows the DVL, where it speaks, says that the vehicle hardly moves."""
+    """Return the windows in which no reading of the DVL shows motion."""
     still = np.ones(len(starts_ns), bool)
     if log.dvl is not None and len(log.dvl):
         speed = np.linalg.norm(log.dvl.z, axis=1)
@@ -94,7 +100,7 @@ def _still_by_dvl(log: Log, starts_ns: TimeArray, ends_ns: TimeArray) -> NDArray
 
 
 def _stays(log: Log, start_ns: int, end_ns: int) -> bool:
-    """Whether DVL and heading, averaged over a stretch, know of no motion either."""
+    """Whether DVL and heading, averaged over the whole time, show no motion either."""
     if log.dvl is not None:
         inside = (log.dvl.t_ns >= start_ns) & (log.dvl.t_ns <= end_ns)
         v, sigma = log.dvl.z[inside], log.dvl.sigma[inside]
@@ -118,7 +124,7 @@ def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _steady(first: int, last: int, means: list[tuple[Array, float]]) -> list[tuple[int, int]]:
-    """Cut a run of quiet windows where its means leave what they were at the beginning: a steady turn is not rest."""
+    """Cut a run of quiet windows where its means differ from those at its beginning: a steady turn is not rest."""
     cuts, begin = [], first
     for k in range(first + 1, last + 2):
         if k > last or any(np.abs(m[k] - m[begin:k].mean(axis=0)).max() > allowed for m, allowed in means):
@@ -128,7 +134,7 @@ def _steady(first: int, last: int, means: list[tuple[Array, float]]) -> list[tup
 
 
 def check_static(log: Log) -> Check:
-    """Read the gyro's bias and |f| where the vehicle was at rest."""
+    """Report the gyro's bias and |f| at rest."""
     found = rests(log)
 
     def draw(axes: Axes) -> None:
@@ -163,19 +169,19 @@ def check_static(log: Log) -> Check:
 
 
 def _bias(log: Log, bias: Array, total_s: float) -> list[Finding]:
-    """Find a gyro that reads more at rest than its stated turn-on bias, the Earth's rate, and noise explain."""
+    """Find a gyro that reads more at rest than its stated turn-on bias, the Earth's rate and its noise explain."""
     noise = log.rig.imu_noise
     largest = float(np.abs(bias).max())
     chance = noise.gyro_density / np.sqrt(total_s)
     if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RATE_RADPS:
         return []
-    says = (
+    message = (
         "At rest the gyro reads ({:.4g}, {:.4g}, {:.4g}) rad/s".format(*bias)
-        + f": {largest / max(noise.gyro_bias_sigma, 1e-12):.0f} times the turn-on bias that is stated "
+        + f": {largest / max(noise.gyro_bias_sigma, 1e-12):.0f} times the stated turn-on bias "
         f"({noise.gyro_bias_sigma:.2g})."
     )
-    mend = (
-        f"streams.imu.noise.gyro_bias_sigma: {largest:.2g}; or take it off by streams.imu.gyro.offset (in the file's "
+    fix = (
+        f"streams.imu.noise.gyro_bias_sigma: {largest:.2g}; or subtract it by streams.imu.gyro.offset (in the file's "
         "axes and unit, with the other sign)"
     )
-    return [Finding("imu", says, mend)]
+    return [Finding("imu", message, fix)]

@@ -1,4 +1,4 @@
-"""What the values themselves give away: stuck axes, zeros and markers of bad rows, repeats, coarse steps, clipping."""
+"""The values themselves: stuck axes, zeros and markers of missing rows, repeats, coarse steps, clipping."""
 
 from __future__ import annotations
 
@@ -9,24 +9,30 @@ from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
 from .channels import Channel, channels_of
+from .missing import FEWEST_MARKED, MissingRows, missing_rows
 from .neighbours import FEWEST
-from .steps import Steps
-from .unread import FEWEST_MARKED, Unread, unread_rows
+from .quantisation import Quantisation
 
 FEW_VALUES = 10
+"""Different values: a channel with no more is reported as coarse."""
 MANY_ROWS = 100
+"""With fewer rows, few different values are no finding."""
 FEWEST_CLIPPED = 5
+"""Readings on the last value: fewer may be chance."""
 CLIPPED_RATIO = 5.0
-"""A distribution thins out towards its ends; clipping piles up what is beyond on the last value."""
+"""A distribution thins out towards its ends; clipping collects everything beyond on the last value."""
 STALE_SHARE = 1e-3
+"""Share of repeated readings that is ignored."""
 SMALL_CHANGE = 0.01
-"""Of the median change from reading to reading: a change so small may round to none."""
+"""Of the median change from reading to reading: a smaller change may round to zero."""
 UNSURE_GPS_M = 100.0
+"""Stated by receivers that have lost their satellites; a fix of one satellite system is good to 10 m."""
 UNSURE_SHARE = 0.01
+"""Share of such fixes that is ignored: a receiver needs a few to start."""
 
 
 def check_values(log: Log) -> Check:
-    """Look for values that are no readings, or coarser than the log states."""
+    """Find values that are not readings, or coarser than the stated noise."""
     facts, findings = {}, []
     for channel in channels_of(log):
         measured = [k for k in range(channel.x.shape[1]) if np.isfinite(channel.sigma[k])]
@@ -45,8 +51,8 @@ def check_values(log: Log) -> Check:
             continue
         x, names, steps = x[:, live], [names[k] for k in live], [steps[k] for k in live]
         sigma = channel.sigma[measured][live]
-        found = unread_rows(channel)
-        findings += _unread(channel, found)
+        found = missing_rows(channel)
+        findings += _missing(channel, found)
         good = found.readings
         findings += _repeats(channel, x, good, steps)
         findings += _coarse(channel, x[good], names, steps, sigma)
@@ -55,7 +61,7 @@ def check_values(log: Log) -> Check:
     return Check("values", facts, tuple(findings))
 
 
-def _described(channel: Channel, x: Array, steps: list[Steps]) -> str:
+def _described(channel: Channel, x: Array, steps: list[Quantisation]) -> str:
     least, largest = (f"{v * channel.shown:.4g}" for v in (x.min(), x.max()))
     text = f"{least} to {largest} {channel.unit}"
     quanta = [s.quantum * channel.shown for s in steps if s.quantum]
@@ -70,52 +76,54 @@ def _stuck(channel: Channel, x: Array, names: list[str]) -> tuple[list[Finding],
     path = f"streams.{channel.stream}"
     if all(stuck):
         value = ", ".join(f"{v:.4g}" for v in x[0] * channel.shown + 0.0)
-        says = f"{channel.name} never changes: it reads ({value}) {channel.unit} in all {len(x)} rows."
-        mend = f"remove {path}: it tells nothing" if channel.stream != "imu" else f"{path}.{channel.quantity}.columns"
-        return [Finding(channel.stream, says, mend)], stuck
+        message = f"{channel.name} never changes: it reads ({value}) {channel.unit} in all {len(x)} rows."
+        fix = f"remove {path}" if channel.stream != "imu" else f"{path}.{channel.quantity}.columns"
+        return [Finding(channel.stream, message, fix)], stuck
     found = []
     for k, name in enumerate(names):
         if stuck[k]:
-            says = f"{name} is {channel.told(float(x[0, k]))} in every row: it was not measured, or it is stuck."
-            loose = {"dvl": "streams.dvl.sigma_m_s", "gps": "streams.gps.sigma_m"}.get(channel.stream)
-            mend = f"{path}.{channel.quantity}.columns" if loose is None else f"{loose}: .inf for that axis"
-            found.append(Finding(channel.stream, says, mend))
+            message = f"{name} is {channel.text(float(x[0, k]))} in every row: it was not measured, or it is stuck."
+            sigma_key = {"dvl": "streams.dvl.sigma_m_s", "gps": "streams.gps.sigma_m"}.get(channel.stream)
+            fix = f"{path}.{channel.quantity}.columns" if sigma_key is None else f"{sigma_key}: .inf for that axis"
+            found.append(Finding(channel.stream, message, fix))
     return found, stuck
 
 
-def _unread(channel: Channel, unread: Unread) -> list[Finding]:
-    """Tell of rows that hold no reading."""
+def _missing(channel: Channel, missing: MissingRows) -> list[Finding]:
+    """Report the rows without a reading."""
     path = f"streams.{channel.stream}"
     valid = f"{path}.valid: {{column: its validity, values: […]}}"
     found, size = [], np.linalg.norm(channel.raw[:, np.isfinite(channel.sigma)], axis=1)
-    if unread.marked.any():
-        says = (
-            f"{int(unread.marked.sum())} rows of {channel.name} hold {unread.marker * channel.shown:g} "
-            f"{channel.unit}, far outside all others: a mark of rows without a reading, used as readings."
+    if missing.marked.any():
+        message = (
+            f"{int(missing.marked.sum())} rows of {channel.name} hold {missing.marker * channel.shown:g} "
+            f"{channel.unit}, far outside all others: a mark of rows without a reading, which is used as a reading."
         )
-        above = _between(size[~unread.marked], size[unread.marked])
+        above = _between(size[~missing.marked], size[missing.marked])
         plain = above is not None and channel.stream != "imu" and not channel.turn
-        found.append(Finding(channel.stream, says, valid + (f"; or {path}.outliers.above: {above:g}" if plain else "")))
-    if unread.zero.any():
-        says = (
-            f"{int(unread.zero.sum())} of {len(size)} rows of {channel.name} are exactly zero on every axis, the "
-            "others "
-            f"about {channel.told(float(np.median(size[unread.readings])))}: rows without a reading, used as readings."
+        found.append(
+            Finding(channel.stream, message, valid + (f"; or {path}.outliers.above: {above:g}" if plain else ""))
         )
-        found.append(Finding(channel.stream, says, valid))
+    if missing.zero.any():
+        message = (
+            f"{int(missing.zero.sum())} of {len(size)} rows of {channel.name} are exactly zero on every axis, the "
+            f"others about {channel.text(float(np.median(size[missing.readings])))}: they hold no reading, but "
+            "are used as readings."
+        )
+        found.append(Finding(channel.stream, message, valid))
     return found
 
 
 def _between(good: Array, bad: Array) -> float | None:
-    """Return a round bound that parts the good sizes from the bad ones; None where there is none."""
+    """Return a round bound that separates the good sizes from the bad ones; None if there is none."""
     if not len(good) or not len(bad) or 1.2 * good.max() >= bad.min():
         return None
     low, high = max(float(good.max()), 1e-12), float(bad.min())
     return float(f"{min(np.sqrt(low * high), 2 * low):.2g}")
 
 
-def _repeats(channel: Channel, x: Array, good: NDArray[np.bool_], steps: list[Steps]) -> list[Finding]:
-    """Find readings that say on every axis what the one before said, more often than small changes explain."""
+def _repeats(channel: Channel, x: Array, good: NDArray[np.bool_], steps: list[Quantisation]) -> list[Finding]:
+    """Find readings that equal the one before on every axis, more often than small changes explain."""
     if any(s.coarse for s in steps):
         return []
     pairs = good[1:] & good[:-1]
@@ -130,38 +138,38 @@ def _repeats(channel: Channel, x: Array, good: NDArray[np.bool_], steps: list[St
     expected, count = by_chance * len(change), int((change == 0).all(axis=1).sum())
     if count <= expected + 5 * np.sqrt(expected) + STALE_SHARE * len(change) or count < FEWEST_MARKED:
         return []
-    says = (
-        f"{count} of {len(x)} {channel.name} readings say exactly what the one before said"
+    message = (
+        f"{count} of {len(x)} {channel.name} readings equal the one before exactly"
         + (f" ({expected:.0f} would by chance)" if expected >= 1 else "")
         + ": they were repeated, not measured, and count twice."
     )
-    mend = f"streams.{channel.stream}.every, if each comes a fixed number of times; else drop them in the file"
-    return [Finding(channel.stream, says, mend)]
+    fix = f"streams.{channel.stream}.every, if each comes a fixed number of times; else drop them in the file"
+    return [Finding(channel.stream, message, fix)]
 
 
-def _coarse(channel: Channel, x: Array, names: list[str], steps: list[Steps], sigma: Array) -> list[Finding]:
+def _coarse(channel: Channel, x: Array, names: list[str], steps: list[Quantisation], sigma: Array) -> list[Finding]:
     """Find steps larger than the stated noise, and channels of hardly any values."""
     found, worst = [], None
     few = [k for k, step in enumerate(steps) if step.levels <= FEW_VALUES and len(x) >= MANY_ROWS]
     if few:
         quantum = max(steps[k].quantum or float(np.ptp(x[:, k])) for k in few)
-        says = (
+        message = (
             f"{_joined([names[k] for k in few])} take{'s' if len(few) == 1 else ''} only "
-            f"{max(steps[k].levels for k in few)} values in {len(x)} rows, {channel.told(quantum)} apart: the error "
-            "is up to half a step, and stays so for as long as a reading rests on one."
+            f"{max(steps[k].levels for k in few)} values in {len(x)} rows, {channel.text(quantum)} apart: the error "
+            "is up to half a step, and constant for as long as the reading is."
         )
-        found.append(Finding(channel.stream, says, _sigma_key(channel, quantum / 2)))
+        found.append(Finding(channel.stream, message, _sigma_key(channel, quantum / 2)))
     for k, (name, step) in enumerate(zip(names, steps, strict=True)):
         if k not in few and step.quantum / np.sqrt(12) > sigma[k] and (worst is None or step.quantum > worst[2]):
             worst = (float(sigma[k]), name, step.quantum)
     if worst is not None:
         stated, name, quantum = worst
         error = quantum / np.sqrt(12)
-        says = (
-            f"{name} comes in steps of {channel.told(quantum)}: rounding alone errs by {channel.told(error)} (1 σ), "
-            f"{error / stated:.1f} times what is stated."
+        message = (
+            f"{name} comes in steps of {channel.text(quantum)}: rounding alone errs by {channel.text(error)} (1 σ), "
+            f"{error / stated:.1f} times the stated sigma."
         )
-        found.append(Finding(channel.stream, says, _sigma_key(channel, error)))
+        found.append(Finding(channel.stream, message, _sigma_key(channel, error)))
     return found
 
 
@@ -170,14 +178,14 @@ def _joined(names: list[str]) -> str:
 
 
 def _sigma_key(channel: Channel, sigma: float) -> str:
-    """Return what makes log.yaml state this sigma of one reading."""
+    """Return the key of log.yaml that states this sigma of one reading."""
     if channel.stream == "imu":
         return f"streams.imu.noise.{channel.name}_density: {sigma * np.sqrt(channel.period_s):.2g}"
     key = {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(channel.stream, "sigma_m")
     return f"streams.{channel.stream}.{key}: {sigma * channel.shown:.2g}"
 
 
-def _clipped(channel: Channel, x: Array, names: list[str], steps: list[Steps]) -> list[Finding]:
+def _clipped(channel: Channel, x: Array, names: list[str], steps: list[Quantisation]) -> list[Finding]:
     """Find ends of the range on which readings pile up."""
     found, kept = [], [k for k, step in enumerate(steps) if not step.coarse and step.levels > FEW_VALUES]
     for k in kept if not channel.turn else []:
@@ -190,29 +198,29 @@ def _clipped(channel: Channel, x: Array, names: list[str], steps: list[Steps]) -
         if ends:
             count = sum(n for _, n in ends)
             values = " and ".join(f"{v * channel.shown:.4g}" for v, _ in ends)
-            says = (
+            message = (
                 f"{names[k]} is clipped: {count} of {len(x)} readings are exactly {values} {channel.unit}, the end "
-                "of its range, and what was beyond is lost."
+                "of its range; larger values are lost."
             )
-            mend = ""
+            fix = ""
             if channel.stream != "imu":
                 bound = min(abs(v) for v, _ in ends) * 0.999
                 component = "" if x.shape[1] == 1 else f", components: [{k}]"
-                mend = f"streams.{channel.stream}.outliers: {{above: {bound:.4g}{component}}} leaves those rows out"
-            found.append(Finding(channel.stream, says, mend))
+                fix = f"streams.{channel.stream}.outliers: {{above: {bound:.4g}{component}}} leaves those rows out"
+            found.append(Finding(channel.stream, message, fix))
     return found
 
 
 def _unsure(log: Log) -> list[Finding]:
-    """Find fixes whose own sigma says that they are none."""
+    """Find GPS fixes with a sigma so large that they are no fixes."""
     if log.gps is None or not len(log.gps):
         return []
     horizontal = log.gps.sigma[:, :2].max(axis=1)
     unsure = np.isfinite(horizontal) & (horizontal > UNSURE_GPS_M)
     if np.mean(unsure) <= UNSURE_SHARE:
         return []
-    says = (
+    message = (
         f"{int(unsure.sum())} of {len(unsure)} GPS fixes state a sigma over {UNSURE_GPS_M:g} m: the receiver had "
-        "lost its satellites, and goes on telling its last or a guessed place."
+        "lost its satellites and repeats its last position, or a guess."
     )
-    return [Finding("gps", says, "streams.gps.valid: {column: its status, values: […]}")]
+    return [Finding("gps", message, "streams.gps.valid: {column: its status, values: […]}")]

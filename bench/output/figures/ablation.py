@@ -1,8 +1,7 @@
-"""What each variant changes: bars of its scores over its baseline's, with intervals; one figure per baseline's log."""
+"""What each variant changes: its scores over its baseline's as bars with intervals; a figure per baseline's log."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
@@ -11,24 +10,26 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...results.summary import Record, groups
-from ..tables.table import percent, score_name, who
+from ..cells import ONLINE, SMOOTHED, column, percent
+from ..sheets import variant
 from .drawing import TEXT_PT, TITLE_PT, WIDTH_IN, Look, empty_figure, legend_below, logarithmic, narrow, title_above
 
 BAR = 0.72
 """Height of a bar, in lines."""
+ALPHA = 0.05
+"""Level of the test, the customary one."""
 WIDE = 4.0
-"""Where ratios span more than this factor, their axis is logarithmic."""
-UNIT = r" (m|°|%|m/s|µs)$"
+"""Where ratios span more than this factor, their axis is logarithmic: bars near 1 would be too short to see."""
 LETTERS = 30
-"""In a line of a variant's name."""
+"""In a line of a variant's name: a third of the figure's width."""
 MINUS = "\N{MINUS SIGN}"
 
 
 def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: str) -> Figure:
     """Draw the ratio of each score to its baseline's as a bar from 1, with its interval: a row of panels per baseline.
 
-    Full for what was said at once, open with hindsight. Beside a bar stands by how much the score changed, in brackets
-    where the test, corrected for how many tests there are, does not tell the change from chance at 5 %.
+    Online bars are filled, smoothed ones open. Beside a bar stands the change of the score in percent, in brackets
+    where the test, corrected for the number of tests, is not significant at 5 %.
 
     Args:
         differences: records of `paired` whose ratio is known, of one baseline's log.
@@ -52,30 +53,30 @@ def draw_ablation(differences: Sequence[Record], looks: dict[str, Look], title: 
             axes.set_yticks([])
             axes.grid(visible=False, axis="y")
             if k == 0:
-                axes.set_title(re.sub(UNIT, "", score_name(score)), fontsize=TITLE_PT)
+                axes.set_title(column(score).name, fontsize=TITLE_PT)
         row_of_panels[0].set_yticks(range(len(of_baseline)), [narrow(name, LETTERS, 2) for name, _ in of_baseline])
         row_of_panels[0].tick_params(axis="y", length=0)
         row_of_panels[0].set_ylabel(f"against\n{narrow(label, 18)}", fontsize=TEXT_PT)
     for axes in panels[-len(scores) :]:
-        axes.set_xlabel("times the baseline's")
+        axes.set_xlabel("ratio to the baseline")
     seeds = [row["pairs"] for row in differences if row["low"] is not None]
     over = f", {max(seeds)} seeds, 95 % intervals" if seeds else ""
     title_above(figure, f"{title}: what each variant changes{over}")
-    handles = [Patch(facecolor="#555555", edgecolor="#555555", label="at once")]
-    if any(row["output"] == "smoothed" for row in differences):
-        handles.append(Patch(facecolor="white", edgecolor="#555555", label="with hindsight"))
+    handles = [Patch(facecolor="#555555", edgecolor="#555555", label=ONLINE)]
+    if any(row["output"] == SMOOTHED for row in differences):
+        handles.append(Patch(facecolor="white", edgecolor="#555555", label=SMOOTHED))
     if seeds:
-        handles.append(Patch(facecolor="none", label="in brackets: p (Holm) of 0.05 or more"))
+        handles.append(Patch(facecolor="none", label="in brackets: not significant (Holm's p is 0.05 or more)"))
     legend_below(figure, handles)
     return figure
 
 
 def _lines(differences: Sequence[Record]) -> list[tuple[str, list[Record]]]:
     """Return one baseline's lines from the top: what stands before each, and its records."""
-    named = [row | {"who": who(row)} for row in differences]
+    named = [row | {"variant": variant(row)} for row in differences]
     return [
         ("" if k else name, rows)
-        for (name,), of_name in groups(named, "who").items()
+        for (name,), of_name in groups(named, "variant").items()
         for k, rows in enumerate(groups(of_name, "output").values())
     ]
 
@@ -85,22 +86,22 @@ def _draw(axes: Axes, bars: Sequence[tuple[int, Record]], colour: str) -> None:
     ends = [1.0]
     for y, row in bars:
         ratio, low, high = row["ratio"], row["ratio_low"] or row["ratio"], row["ratio_high"] or row["ratio"]
-        face = colour if row["output"] == "online" else "white"
+        face = colour if row["output"] == ONLINE else "white"
         axes.barh(y, ratio - 1, left=1, height=BAR, facecolor=face, edgecolor=colour, linewidth=0.9)
         if row["ratio_low"] is not None:
             whiskers = {"color": "black", "elinewidth": 0.9, "capsize": 1.8, "capthick": 0.9}
             axes.errorbar(ratio, y, xerr=[[max(0.0, ratio - low)], [max(0.0, high - ratio)]], fmt="none", **whiskers)
-        told = row["p_holm"] is None or row["p_holm"] < 0.05
+        significant = row["p_holm"] is None or row["p_holm"] < ALPHA
         change = (percent(ratio) if ratio >= 10 else f"{percent(ratio)} %").replace("-", MINUS)
         style = {"va": "center", "fontsize": TEXT_PT, "textcoords": "offset points"}
-        axes.annotate(change if told else f"({change})", (max(1.0, ratio, high), y), (3, 0), **style)
+        axes.annotate(change if significant else f"({change})", (max(1.0, ratio, high), y), (3, 0), **style)
         ends += [low, high]
     axes.axvline(1, color="black", linewidth=0.8)
     low, high = min(ends), max(ends)
     if high / low > WIDE:
         logarithmic(axes, "x")
         room = high / low
-        axes.set_xlim(low / room**0.05, high * room**0.55)  # for the numbers
+        axes.set_xlim(low / room**0.05, high * room**0.55)  # room for the numbers beside the bars
         axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if room < 30 else (1.0,)))
     else:
         room = max(high - low, 0.02)

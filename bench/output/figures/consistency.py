@@ -1,4 +1,4 @@
-"""Is the error as large as the covariance says? NEES over time, averaged over seeds, with the intervals it is due."""
+"""Are covariances consistent? NEES over time, averaged over seeds, with its chi-square intervals."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from ...metrics import BLOCKS, DOF
 from ...metrics.consistency import Average, anees_of, interval
 from ...results.summary import Record, groups
+from ..cells import NEES_OVER_DOF, ONLINE, SMOOTHED, TIME
 from .drawing import (
     TEXT_PT,
     TITLE_PT,
@@ -25,16 +26,19 @@ from .drawing import (
 )
 
 POINTWISE = 0.95
+"""Of the dark band: a consistent estimator's points lie in it with this probability, each by itself."""
 FITS_A_PANEL = 12
-"""So many lines of a legend fit where a sixth panel would be."""
+"""Lines of a legend that fit in place of a sixth panel."""
+WIDEST_IN_A_PANEL = 32
+"""Letters of a legend's line that fit there."""
 
 
 def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Figure:
-    """Draw the NEES of each block, averaged over the seeds, at the fixed times of one log, with two bands of honesty.
+    """Draw the NEES of each block, averaged over the seeds, at the fixed times of one log, with two chi-square bands.
 
-    The dark band holds 95 % of an honest estimator's points, each time by itself; the pale one 99.9 % of honest lines,
-    all times of a line together, see `consistency`. Both are those of the most seeds that any estimator has, one
-    included. Hindsight is open and dotted.
+    A consistent estimator has 95 % of its points in the dark band, each time by itself; 99.9 % of consistent estimators
+    stay in the pale band at all times, see `metrics.consistency`. Both bands are those of the estimator with the most
+    seeds. Smoothed lines are dotted, with open markers.
 
     Args:
         rows: of one log.
@@ -47,7 +51,7 @@ def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fig
     for block, axes in zip(BLOCKS, panels, strict=False):
         averages = {key: of_line[block] for key, of_line in lines.items() if block in of_line}
         for (label, output), average in averages.items():
-            online, look = output == "online", looks[label]
+            online, look = output == ONLINE, looks[label]
             axes.plot(
                 average.t_s,
                 average.value,
@@ -64,24 +68,24 @@ def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fig
             _draw_bands(axes, max(averages.values(), key=lambda average: (average.runs.max(), len(average))))
         axes.set_title(f"{block}, {DOF[block]} dof", fontsize=TITLE_PT)
     for axes in panels[3:5]:
-        axes.set_xlabel("time (s)")
-    panels[2].set_xlabel("time (s)")
+        axes.set_xlabel(TIME)
+    panels[2].set_xlabel(TIME)
     panels[2].tick_params(labelbottom=True)
     for axes in panels[::3]:
-        axes.set_ylabel("NEES / dof")
+        axes.set_ylabel(NEES_OVER_DOF)
     runs = max((int(average.runs.max()) for of_line in lines.values() for average in of_line.values()), default=0)
     over = f"mean of {runs} seeds" if runs > 1 else "one run"
     title_above(figure, f"{title}: normalised estimation error squared (NEES) over its degrees of freedom, {over}")
     handles = [
         look_handle(label, looks[label]) for label in dict.fromkeys(label for (label, _), of in lines.items() if of)
     ]
-    if any(output == "smoothed" for (_, output), of_line in lines.items() if of_line):
+    if any(output == SMOOTHED for (_, output), of_line in lines.items() if of_line):
         dotted = {"marker": "o", "markersize": 3.5, "markerfacecolor": "white", "linestyle": ":", "linewidth": 0.8}
-        handles.append(Line2D([], [], color="black", label="with hindsight", **dotted))
-    handles.append(Line2D([], [], color="black", alpha=0.25, linewidth=6, label="95 % of honest points"))
-    handles.append(Line2D([], [], color="black", alpha=0.1, linewidth=6, label="99.9 % of honest lines"))
+        handles.append(Line2D([], [], color="black", label=SMOOTHED, **dotted))
+    handles.append(Line2D([], [], color="black", alpha=0.25, linewidth=6, label="95 % of consistent points"))
+    handles.append(Line2D([], [], color="black", alpha=0.1, linewidth=6, label="99.9 % of consistent lines"))
     panels[5].axis("off")
-    if len(handles) <= FITS_A_PANEL and max(len(str(handle.get_label())) for handle in handles) < 32:
+    if len(handles) <= FITS_A_PANEL and max(len(str(handle.get_label())) for handle in handles) < WIDEST_IN_A_PANEL:
         panels[5].legend(handles=handles, loc="center", frameon=False, fontsize=TEXT_PT)
     else:
         legend_below(figure, handles)
@@ -89,7 +93,7 @@ def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fig
 
 
 def _draw_bands(axes: Axes, average: Average) -> None:
-    """Draw where an honest average lies; the dark band and the points set the scale."""
+    """Draw where a consistent average lies; the dark band and the points set the scale."""
     low, high = interval(np.array([average.dof.max()]), POINTWISE)
     axes.axhspan(float(low[0]), float(high[0]), color="black", alpha=0.15, linewidth=0)
     logarithmic(axes, "y")

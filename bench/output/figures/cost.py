@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from ...results.summary import Record, groups
+from ..cells import COMPUTING, ONLINE, SMOOTHED, column
 from .drawing import COLUMN_IN, TITLE_PT, WIDTH_IN, Look, empty_figure, handle, legend_below, logarithmic, narrow
 
 
@@ -17,7 +18,7 @@ def priced(summary: Sequence[Record]) -> list[Record]:
 
 
 def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
-    """Draw ATE against computing time per second of voyage, a panel per log; filled online, open with hindsight."""
+    """Draw ATE against computing time per second of the log, a panel per log: online filled, smoothed open."""
     logs = groups(summary, "log")
     columns = min(2, len(logs))
     lines = math.ceil(len(logs) / columns)
@@ -32,18 +33,18 @@ def draw_costs(summary: Sequence[Record], looks: dict[str, Look]) -> Figure:
             y_m = [row["ate_rmse_m"] for row in of_label]
             axes.plot(x_ms, y_m, color=look.colour, linewidth=0.8)
             for x, y, row in zip(x_ms, y_m, of_label, strict=True):
-                face, size = (look.colour, 6) if row["output"] == "online" else ("white", 4)
+                face, size = (look.colour, 6) if row["output"] == ONLINE else ("white", 4)
                 style = {"marker": look.marker, "markersize": size, "markerfacecolor": face, "linestyle": "none"}
                 axes.plot(x, y, color=look.colour, **style)
         first = of_log[0]
         settings = f"alignment {first['align']}, {first['dims']}, {first['truth_kind']}"
         axes.set_title(f"{narrow(log, 50)}\n{settings}", fontsize=TITLE_PT)
-        axes.set_xlabel("computing (ms per second of voyage)")
-        axes.set_ylabel("ATE (m)")
+        axes.set_xlabel(COMPUTING)
+        axes.set_ylabel(column("ate_rmse_m").axis)
         axes.margins(0.12)
         logarithmic(axes, "xy")
     handles = [handle(label, looks[label].marker, looks[label].colour, True) for (label,) in groups(summary, "label")]
-    if any(row["output"] == "smoothed" for row in summary):
-        handles.append(handle("with hindsight", "o", "black", False))
+    if any(row["output"] == SMOOTHED for row in summary):
+        handles.append(handle(SMOOTHED, "o", "black", False))
     legend_below(figure, handles)
     return figure

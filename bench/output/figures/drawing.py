@@ -1,7 +1,7 @@
 """How every figure looks: one look per estimator, panels, axes, legends, and the files they are saved as.
 
 Figures are made for a journal's page: one or two columns wide, letters of 7 and 8 points, TrueType fonts in the PDF.
-What colour tells is told again by marker or dash, for readers of grey prints.
+Markers and dashes repeat what colours say, for grey prints.
 """
 
 from __future__ import annotations
@@ -22,18 +22,20 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, NullLocator
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F", "#B8A000")
-"""Okabe & Ito's colours, which readers with any colour vision tell apart; black is the truth's."""
+"""Colours of Okabe & Ito, distinct to readers with any colour vision; black is the truth."""
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 COLUMN_IN, WIDTH_IN, PAGE_IN = 3.5, 7.16, 8.8
 """One column of a journal's page, both, and its height."""
 TITLE_PT, TEXT_PT = 8, 7
+"""Points: journals ask for at least 6 to 7 in print."""
 LETTER_IN = 0.6 / 72
 """Width of a letter per point of its size, on the safe side."""
 DPI = 300
+"""Of PNG files; journals ask for at least 300."""
 LONGEST = 46
-"""A label with more letters than this goes on in another line of the legend."""
+"""A label with more letters than this is wrapped in the legend: half of a page's width."""
 
 
 class Look(NamedTuple):
@@ -76,12 +78,12 @@ def empty_figure(
 
 
 def plain(text: str) -> str:
-    """Return a text as matplotlib shows it as it stands: $ is no mathematics, and _ before a label does not hide it."""
+    """Escape a text for matplotlib: "$" begins no mathematics, and a leading "_" does not hide a label."""
     return text.replace("$", r"\$").replace("_", " _", 1) if text.startswith("_") else text.replace("$", r"\$")
 
 
 def narrow(text: str, letters: int, lines: int = 3) -> str:
-    """Return a text in lines of so many letters, and of so many lines, as matplotlib shows it as it stands."""
+    """Wrap a text into at most so many lines of so many letters, escaped for matplotlib."""
     return plain("\n".join(wrap(text, letters, max_lines=lines, placeholder=" …")))
 
 
@@ -121,14 +123,14 @@ def logarithmic(axes: Axes, which: str) -> None:
 def handle(
     label: str, marker: str, colour: str, filled: bool, line: str | tuple[int, tuple[float, ...]] = "none"
 ) -> Line2D:
-    """Return what stands for an estimator in a legend."""
+    """Return the legend entry of an estimator."""
     face = colour if filled else "white"
     style = {"marker": marker, "markersize": 4.5, "markerfacecolor": face, "linestyle": line, "linewidth": 1.0}
     return Line2D([], [], color=colour, label=plain(label), **style)
 
 
 def look_handle(label: str, look: Look) -> Line2D:
-    """Return what stands in a legend for an estimator that is drawn as a line with markers."""
+    """Return the legend entry of an estimator that is drawn as a line with markers."""
     return handle(label, look.marker, look.colour, True, look.dash)
 
 
@@ -138,7 +140,7 @@ def save(figure: Figure, stem: Path) -> list[Path]:
     files = [Path(f"{stem}.pdf"), Path(f"{stem}.png")]
     with rc_context({"pdf.fonttype": 42}):
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # it has settled: once is enough for both
+        figure.set_layout_engine("none")  # computed once, for both files
         for file in files:
             figure.savefig(file, dpi=DPI, metadata={"CreationDate": None} if file.suffix == ".pdf" else {})
     return files

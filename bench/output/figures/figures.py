@@ -20,7 +20,7 @@ __all__ = ["Track", "draw_figures", "load_trajectory", "tracks_of"]
 
 
 def draw_figures(rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = ()) -> list[Path]:
-    """Draw every figure of an experiment into folder/figures and return the files; what cannot be drawn is left out.
+    """Draw every figure of an experiment into folder/figures and return the files; a figure without data is left out.
 
     Args:
         rows: of the store; tracks and errors of each simulated log are drawn with the first of its seeds.

@@ -1,4 +1,4 @@
-"""How steps' times are distributed: the share of steps that take longer than so long, on logarithmic axes."""
+"""The distribution of step times: the share of steps that take longer than a given time, on logarithmic axes."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from matplotlib.ticker import LogLocator
 
 from ...results.step_time import StepTimes, machine_name, pooled_steps, usual_machine
 from ...results.summary import Record, groups
+from ..cells import STEP_TIME
 from .drawing import COLUMN_IN, Look, empty_figure, legend_below, logarithmic, look_handle, title_above
 
 MARKED = (0.5, 0.99)
-"""Quantiles with a marker; a third one stands at the longest step."""
+"""Quantiles with a marker, the columns of the main table; a third marker stands at the longest step."""
 
 
 def step_times(rows: Sequence[Record]) -> tuple[dict[str, StepTimes], str | None]:
     """Return the step times of each estimator on one log, by label, and the machine: the one with the most runs.
 
-    Runs of other machines are left out, and so are those that did not come to their end.
+    Runs on other machines and runs that did not finish are left out.
     """
     done = [row for row in rows if row["status"] == "done" and row["output"] == "online"]
     machine = usual_machine(done)
@@ -28,7 +29,7 @@ def step_times(rows: Sequence[Record]) -> tuple[dict[str, StepTimes], str | None
 
 
 def draw_step_times(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Figure:
-    """Draw the share of steps that took longer against how long, by estimator of one log; seeds pooled.
+    """Draw the share of steps that took longer than a time against that time, by estimator of one log; seeds pooled.
 
     Markers stand at the median, the 99th percentile and the longest step. The title names their machine.
     """
@@ -44,7 +45,7 @@ def draw_step_times(rows: Sequence[Record], looks: dict[str, Look], title: str) 
     logarithmic(axes, "xy")
     axes.yaxis.set_major_locator(LogLocator())
     axes.set_ylim(top=1.3)
-    axes.set(xlabel="time of one step (µs)", ylabel="share of steps that take longer")
+    axes.set(xlabel=STEP_TIME, ylabel="share of steps that take longer")
     runs = max(times.runs for times in every.values())
     others = {row["machine"] for row in rows if row.get("step_histogram")} - {machine}
     left_out = f" (runs on {len(others)} other machine{'s' if len(others) > 1 else ''} left out)" if others else ""

@@ -16,6 +16,7 @@ from ....datasets.state import Array
 from ....datasets.trajectory import Trajectory
 from ...metrics import Alignment, ScoreError, align, associate
 from ...results.summary import Record
+from ..cells import DIRECTIONS, ONLINE, SMOOTHED, TIME
 from .drawing import (
     COLUMN_IN,
     TEXT_PT,
@@ -29,13 +30,14 @@ from .drawing import (
     title_above,
 )
 
-AXES = ("east", "north", "up")
 MARKS = 6
 """How many markers a track has."""
 MOST_ROWS = 6
 """More estimators than this do not fit one page of errors."""
+SMALLEST_EXTENT_M = 1.0
+"""Of a truth that hardly moves: otherwise every track would be far from it."""
 
-HINDSIGHT: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": (0, (1, 1.2))}
+SMOOTHED_LINE: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": (0, (1, 1.2))}
 BOUND: dict[str, Any] = {"color": "black", "linewidth": 0.5, "linestyle": (0, (6, 2))}
 
 
@@ -81,9 +83,9 @@ def load_trajectory(path: Path) -> Trajectory:
 
 
 def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> Figure:
-    """Draw the tracks from above, equal axes; hindsight thin, its markers open."""
+    """Draw the tracks from above, equal axes; smoothed tracks are thin, with open markers."""
     truth = next((track.truth for track in tracks if track.truth is not None), None)
-    near = [track.estimate.p_WB_W[:, :2] for track in tracks if _is_near(track)]
+    near = [track.estimate.p_WB_W[:, :2] for track in tracks if is_near(track)]
     near += [truth.p_WB_W[:, :2]] if truth is not None else []
     inside = np.concatenate(near) if near else np.zeros((1, 2))
     wide, high = np.ptp(inside, axis=0).clip(1e-3)
@@ -96,7 +98,7 @@ def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
         handles.append(Line2D([], [], color="black", marker="o", markersize=5, linestyle="none", label="start"))
     labels = list(looks)
     for track in tracks:
-        online, look, place = track.output == "online", looks[track.label], labels.index(track.label)
+        online, look, place = track.output == ONLINE, looks[track.label], labels.index(track.label)
         points = len(track.estimate.t_ns)
         every = max(1, points // MARKS)
         first = int((place + (0.5 if not online else 0.0)) / len(labels) * every)  # so that none hides another's
@@ -111,16 +113,16 @@ def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
             markerfacecolor=look.colour if online else "white",
             markevery=(min(first, points - 1), every),
         )
-    axes.dataLim.update_from_data_xy(inside, ignore=True)  # a track that got lost may leave the picture
+    axes.dataLim.update_from_data_xy(inside, ignore=True)  # a track that got lost may leave the figure
     axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="east (m)", ylabel="north (m)")
+    axes.set(xlabel=f"{DIRECTIONS[0]} (m)", ylabel=f"{DIRECTIONS[1]} (m)")
     title_above(figure, f"{title}: tracks{_aligned(tracks)}")
     drawn = dict.fromkeys(track.label for track in tracks)
     handles += [look_handle(label, looks[label]) for label in drawn]
-    if any(track.output == "smoothed" for track in tracks):
+    if any(track.output == SMOOTHED for track in tracks):
         open_marker = {"marker": "o", "markersize": 3.5, "markerfacecolor": "white", "markeredgewidth": 0.5}
-        handles.append(Line2D([], [], color="black", linewidth=0.5, label="with hindsight", **open_marker))
+        handles.append(Line2D([], [], color="black", linewidth=0.5, label=SMOOTHED, **open_marker))
     legend_below(figure, handles, most=3)
     return figure
 
@@ -134,10 +136,10 @@ def pages_of(tracks: Sequence[Track]) -> Iterator[list[Track]]:
 
 
 def draw_errors(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> Figure:
-    """Draw the position error over time by axis, a row per estimator, with ±3σ where nothing was aligned."""
+    """Draw the position error over time by axis, a row per estimator, with ±3σ where the track was not aligned."""
     tracks = [track for track in tracks if track.truth is not None]
     labels = list(dict.fromkeys(track.label for track in tracks))
-    known = [axis for axis in range(3) if any(np.isfinite(_error(track)[:, axis]).any() for track in tracks)] or [0]
+    known = [axis for axis in range(3) if any(np.isfinite(error_m(track)[:, axis]).any() for track in tracks)] or [0]
     figure, panels = empty_figure(len(labels), len(known), WIDTH_IN, 0.6 + 1.15 * len(labels))
     grid = np.reshape(np.array(panels, dtype=object), (len(labels), len(known)))
     for track in tracks:
@@ -146,54 +148,57 @@ def draw_errors(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
     for label, row in zip(labels, grid, strict=True):
         row[0].set_ylabel(narrow(label, 18), fontsize=TEXT_PT)
     for axes, axis in zip(grid[0], known, strict=True):
-        axes.set_title(f"{AXES[axis]} error (m)", fontsize=TITLE_PT)
+        axes.set_title(f"{DIRECTIONS[axis]} error (m)", fontsize=TITLE_PT)
     for axes in grid[-1]:
-        axes.set_xlabel("time (s)")
+        axes.set_xlabel(TIME)
     title_above(figure, f"{title}: errors{_aligned(tracks)}")
-    hindsight = [track for track in tracks if track.output == "smoothed"]
-    handles = [Line2D([], [], color="black", linewidth=1.0, label="online")]
-    if any(_has_bounds(track) for track in tracks if track.output == "online"):
-        handles.append(Line2D([], [], color="black", alpha=0.2, linewidth=6, label="±3σ, online"))
-    if hindsight:
-        handles.append(Line2D([], [], **HINDSIGHT, label="with hindsight"))
-    if any(_has_bounds(track) for track in hindsight):
-        handles.append(Line2D([], [], **BOUND, label="±3σ, with hindsight"))
+    smoothed = [track for track in tracks if track.output == SMOOTHED]
+    handles = [Line2D([], [], color="black", linewidth=1.0, label=ONLINE)]
+    if any(has_bounds(track) for track in tracks if track.output == ONLINE):
+        handles.append(Line2D([], [], color="black", alpha=0.2, linewidth=6, label=f"±3σ, {ONLINE}"))
+    if smoothed:
+        handles.append(Line2D([], [], **SMOOTHED_LINE, label=SMOOTHED))
+    if any(has_bounds(track) for track in smoothed):
+        handles.append(Line2D([], [], **BOUND, label=f"±3σ, {SMOOTHED}"))
     legend_below(figure, handles)
     return figure
 
 
 def _draw_error(axes: Axes, track: Track, axis: int, colour: str) -> None:
-    online = track.output == "online"
+    online = track.output == ONLINE
     t_s = (track.estimate.t_ns - track.estimate.t_ns[0]) * 1e-9
-    if _has_bounds(track):
+    if has_bounds(track):
         assert track.estimate.P is not None
         variance = track.estimate.P[:, 3 + axis, 3 + axis]
-        there = np.isfinite(variance)  # with hindsight, some smoothers tell only some
+        there = np.isfinite(variance)  # some smoothers keep the covariance of some states only
         t_there_s, bound = t_s[there], 3 * np.sqrt(variance[there].clip(min=0))
         if online:
             axes.fill_between(t_there_s, -bound, bound, color=colour, alpha=0.2, linewidth=0)
         else:
             axes.plot(t_there_s, bound, **BOUND)
             axes.plot(t_there_s, -bound, **BOUND)
-    style = {"color": colour, "linewidth": 1.0} if online else HINDSIGHT
-    axes.plot(t_s, _error(track)[:, axis], **style)
+    style = {"color": colour, "linewidth": 1.0} if online else SMOOTHED_LINE
+    axes.plot(t_s, error_m(track)[:, axis], **style)
     axes.axhline(0, color="black", linewidth=0.4)
 
 
-def _error(track: Track) -> Array:
+def error_m(track: Track) -> Array:
+    """Return the position error (n, 3), m, of a track that has a truth."""
     assert track.truth is not None
     return track.estimate.p_WB_W - track.truth.p_WB_W
 
 
-def _is_near(track: Track) -> bool:
-    """Whether a track keeps within the truth's own extent of it."""
+def is_near(track: Track) -> bool:
+    """Whether a track keeps within the truth's own extent of it: one that got lost does not set a figure's scale."""
     if track.truth is None:
         return True
-    return bool(np.abs(_error(track)[:, :2]).max() < np.ptp(track.truth.p_WB_W[:, :2], axis=0).max())
+    extent_m = np.ptp(track.truth.p_WB_W[:, :2], axis=0).max()
+    return bool(np.nanmax(np.abs(error_m(track)[:, :2]), initial=0.0) < max(extent_m, SMALLEST_EXTENT_M))
 
 
-def _has_bounds(track: Track) -> bool:
-    return track.align == "none" and track.estimate.P is not None
+def has_bounds(track: Track) -> bool:
+    """Whether the error has a σ in its own axes: there is a truth and a covariance, and nothing was aligned."""
+    return track.truth is not None and track.align == "none" and track.estimate.P is not None
 
 
 def _aligned(tracks: Sequence[Track]) -> str:

@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const page = JSON.parse(document.getElementById("page").textContent);
-  const AXES = ["east", "north", "up"];
+  const { axes } = page;
   const drawn = new Map(); // and how wide
   const seeds = new WeakMap();
 
@@ -10,8 +10,6 @@
   const plain = (text) => text.replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
   const floats = (text) => new Float32Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-  const named = (of) => plain(of.output === "online" ? of.label : `${of.label}, sees ${of.ahead}`);
-  const isOnline = (of) => of.output === "online";
 
   function decoded(block) {
     const read = (each) => each && each.map(floats);
@@ -42,8 +40,8 @@
   function line(of, extra) {
     const look = page.looks[of.label];
     const rank = Object.keys(page.looks).indexOf(of.label) / Object.keys(page.looks).length;
-    const style = { color: look.colour, dash: isOnline(of) ? look.dash : "dot", width: isOnline(of) ? 3 - 1.8 * rank : 1.2 };
-    return { type: "scatter", mode: "lines", name: named(of), legendgroup: named(of), line: style, ...extra };
+    const style = { color: look.colour, dash: of.online ? look.dash : "dot", width: of.online ? 3 - 1.8 * rank : 1.2 };
+    return { type: "scatter", mode: "lines", name: plain(of.name), legendgroup: plain(of.name), line: style, ...extra };
   }
 
   // plain numbers over at least a factor of four, so that small differences look small
@@ -58,14 +56,14 @@
     tracks(section) {
       const { truth, tracks } = chosen(section);
       const traces = tracks.map((track) => line(track, {
-        x: track.p[0], y: track.p[1], customdata: track.t, hovertemplate: "east %{x:.2f} m, north %{y:.2f} m<br>at %{customdata:.1f} s",
+        x: track.p[0], y: track.p[1], customdata: track.t, hovertemplate: axes.of_track,
       }));
       if (truth) {
         const ink = colour("ink");
         traces.unshift({ type: "scatter", mode: "lines", name: "truth", x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
         traces.push({ type: "scatter", mode: "markers", name: "start", x: truth[0].slice(0, 1), y: truth[1].slice(0, 1), marker: { color: ink, size: 9 }, hoverinfo: "name" });
       }
-      const layout = { xaxis: { title: { text: "east, m" } }, yaxis: { title: { text: "north, m" }, scaleanchor: "x" } };
+      const layout = { xaxis: { title: { text: axes.east } }, yaxis: { title: { text: axes.north }, scaleanchor: "x" } };
       if (tracks.some((track) => !track.near)) { // one that got lost may leave the picture
         const inside = tracks.filter((track) => track.near).map((track) => track.p);
         if (truth) inside.push(truth);
@@ -79,25 +77,25 @@
       const tracks = chosen(section).tracks.filter((track) => track.error);
       const only = section.querySelector("select.estimator").value;
       const shown = tracks.filter((track) => only === "" || track.label === only);
-      const known = AXES.map((_, axis) => axis).filter((axis) => tracks.some((track) => track.error[axis].some(Number.isFinite)));
+      const known = axes.errors.map((_, axis) => axis).filter((axis) => tracks.some((track) => track.error[axis].some(Number.isFinite)));
       const traces = [];
-      const layout = { xaxis: { title: { text: "time from the first pose, s" }, anchor: `y${known.length > 1 ? known.length : ""}` } };
+      const layout = { xaxis: { title: { text: axes.time }, anchor: `y${known.length > 1 ? known.length : ""}` } };
       known.forEach((axis, k) => {
         const yaxis = `y${k ? k + 1 : ""}`;
         const height = 1 / known.length;
-        const panel = { title: { text: `${AXES[axis]}, m` }, domain: [1 - (k + 1) * height + 0.02, 1 - k * height - 0.02] };
+        const panel = { title: { text: axes.errors[axis] }, domain: [1 - (k + 1) * height + 0.02, 1 - k * height - 0.02] };
         if (only === "" && shown.some((track) => !track.near) && shown.some((track) => track.near)) {
           panel.range = span(shown.filter((track) => track.near).map((track) => track.error[axis]));
         }
         layout[`yaxis${k ? k + 1 : ""}`] = panel;
         for (const track of shown) {
-          if (only !== "" && track.sigma && isOnline(track)) {
+          if (only !== "" && track.sigma && track.online) {
             const bound = track.sigma[axis].map((sigma) => 3 * sigma);
             const edge = { ...line(track), x: track.t, yaxis, line: { width: 0 }, hoverinfo: "skip", showlegend: false };
             traces.push({ ...edge, y: bound.map((x) => -x) });
             traces.push({ ...edge, y: bound, fill: "tonexty", fillcolor: `${page.looks[track.label].colour}33`, name: "±3σ", showlegend: k === 0 });
           }
-          traces.push(line(track, { x: track.t, y: track.error[axis], yaxis, showlegend: k === 0, hovertemplate: "%{y:.3f} m at %{x:.1f} s" }));
+          traces.push(line(track, { x: track.t, y: track.error[axis], yaxis, showlegend: k === 0, hovertemplate: axes.of_error }));
         }
       });
       return [traces, layout];
@@ -109,16 +107,16 @@
       const edge = { type: "scatter", mode: "lines", x: widest.t, line: { width: 0 }, hoverinfo: "skip", showlegend: false };
       const traces = [
         { ...edge, y: widest.low },
-        { ...edge, y: widest.high, fill: "tonexty", fillcolor: "rgba(128,128,128,0.2)", name: `honest, ${widest.runs} seeds`, showlegend: true },
+        { ...edge, y: widest.high, fill: "tonexty", fillcolor: "rgba(128,128,128,0.2)", name: `consistent, ${widest.runs} seeds`, showlegend: true },
       ];
       for (const of of lines) {
         const { symbol } = page.looks[of.label];
         traces.push(line(of, {
-          x: of.t, y: of.value, mode: "lines+markers", marker: { symbol: isOnline(of) ? symbol : `${symbol}-open`, size: 7, color: page.looks[of.label].colour },
-          hovertemplate: `%{y:.3g} at %{x:.1f} s, ${of.runs} seeds`,
+          x: of.t, y: of.value, mode: "lines+markers", marker: { symbol: of.online ? symbol : `${symbol}-open`, size: 7, color: page.looks[of.label].colour },
+          text: of.says, hovertemplate: "%{text}",
         }));
       }
-      return [traces, { xaxis: { title: { text: "time, s" } }, yaxis: { title: { text: "NEES by degree of freedom" }, ...logarithmic([widest.low, widest.high, ...lines.map((of) => of.value)].flat()) } }];
+      return [traces, { xaxis: { title: { text: axes.time } }, yaxis: { title: { text: axes.nees }, ...logarithmic([widest.low, widest.high, ...lines.map((of) => of.value)].flat()) } }];
     },
 
     costs(section) {
@@ -128,13 +126,13 @@
         const look = page.looks[label];
         return {
           type: "scatter", mode: "lines+markers", name: plain(label), x: points.map((of) => of.x), y: points.map((of) => of.y),
-          text: points.map((of) => `sees ${of.ahead} ahead`), line: { color: look.colour, width: 1 },
-          marker: { color: look.colour, size: 11, symbol: points.map((of) => (isOnline(of) ? look.symbol : `${look.symbol}-open`)) },
-          hovertemplate: "%{y:.3g} m, %{x:.3g} ms/s<br>%{text}",
+          text: points.map((of) => `${of.says}<br>${of.output}`), line: { color: look.colour, width: 1 },
+          marker: { color: look.colour, size: 11, symbol: points.map((of) => (of.online ? look.symbol : `${look.symbol}-open`)) },
+          hovertemplate: "%{text}",
         };
       });
       const [x, y] = ["x", "y"].map((name) => logarithmic(traces.flatMap((trace) => trace[name])));
-      return [traces, { xaxis: { title: { text: "computing, ms per second of voyage" }, ...x }, yaxis: { title: { text: "ATE, m" }, ...y } }];
+      return [traces, { xaxis: { title: { text: axes.computing }, ...x }, yaxis: { title: { text: axes.ate }, ...y } }];
     },
   };
 

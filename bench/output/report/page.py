@@ -1,4 +1,4 @@
-"""The page: what an experiment found, in the order in which a reader asks, in one file without network."""
+"""The page: what an experiment found, in the order in which a reader asks, in one file that needs no network."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ import pandas as pd
 from ...errors import ExperimentError
 from ...results.store import load_runs
 from ...results.summary import Record, groups, records, summarise
+from .. import cells, sheets
 from ..figures.drawing import looks_of
-from ..tables.table import mostly_outside, not_positive
-from . import curves, runs, sheets
+from ..remarks import mostly_outside, not_positive
+from . import curves, runs
 from .results import differences_of, in_order, kept_plan
 from .tracks import Drawn, draw_all
 
 HERE = Path(__file__).parent
-STARTING_LETTERS = 8
-"""How many letters of a run's identity the page shows."""
 
 
 class NoExtraError(ExperimentError):
@@ -122,19 +121,19 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
         description="" if plan is None else plan.description,
         again=None if again is None else quote(again),
         folder=quote(str(folder)),
-        example=next(((row["identity"] or "")[:STARTING_LETTERS] for row in every if row["identity"]), None),
+        example=next(((row["identity"] or "")[: sheets.SHOWN_OF_IDENTITY] for row in every if row["identity"]), None),
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         facts=runs.facts(every),
         failures=runs.failures(every),
-        warnings=[*mostly_outside(rows), *not_positive(summary), *_mixed(every), *_missing(drawn)],
+        warnings=[*mostly_outside(every), *not_positive(summary), *_mixed(every), *_missing(drawn)],
         accuracy=[sheets.accuracy(of, done) for of in by_log.values()],
         over_floor=_there(map(sheets.over_floor, by_log.values())),
         differences=sheets.differences(differences),
-        honesty=_there(map(sheets.honesty, by_log.values())),
+        consistency=_there(map(sheets.consistency, by_log.values())),
         late=_there(map(sheets.late_or_out, by_log.values())),
         costs=_there(map(sheets.cost, by_log.values())),
         logs=logs,
-        runs=sheets.runs(every),
+        runs=sheets.every_run(every),
         environments=runs.environments(every),
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
         scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in ("tables.js", "figures.js")],
@@ -143,9 +142,26 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
         details=runs.details(every),
         page={
             "looks": curves.looks(looks_of([label for (label,) in groups(every, "label")])),
+            "axes": axes(),
             "logs": [{key: log[key] for key in ("name", "truth", "aligned", "anees", "costs")} for log in logs],
         },
     )  # fmt: skip
+
+
+def axes() -> dict[str, Any]:
+    """Return the titles of the figures' axes, and what plotly says of a point of a track or of an error."""
+    east, north, _ = cells.DIRECTIONS
+    return {
+        "east": f"{east} (m)",
+        "north": f"{north} (m)",
+        "errors": [f"{direction} error (m)" for direction in cells.DIRECTIONS],
+        "time": cells.TIME,
+        "nees": cells.NEES_OVER_DOF,
+        "computing": cells.COMPUTING,
+        "ate": cells.column("ate_rmse_m").axis,
+        "of_track": "east %{x:.2f} m, north %{y:.2f} m<br>at %{customdata:.1f} s",
+        "of_error": "%{y:.3f} m at %{x:.1f} s",
+    }
 
 
 def ordinal(k: int) -> str:
@@ -155,7 +171,7 @@ def ordinal(k: int) -> str:
 
 
 def embedded(value: Any) -> Any:
-    """Return a value as JSON that no text in it can break out of a script element with; what is not finite is null."""
+    """Return a value as JSON for a script element, which no text in it can end; non-finite numbers are null."""
     from markupsafe import Markup
 
     text = json.dumps(_finite(value), separators=(",", ":"))
@@ -180,8 +196,8 @@ def _there(found: Iterable[sheets.Sheet | None]) -> list[sheets.Sheet]:
 
 
 def _mixed(every: Sequence[Record]) -> list[str]:
-    """Say where rows are not of one make."""
-    what = {"machine": "machines: timings from different ones are not to be compared", "versions": "sets of versions"}
+    """Say where rows are from several machines or versions."""
+    what = {"machine": "machines: their timings are not comparable", "versions": "sets of versions"}
     kinds = {column: len({row[column] for row in every}) for column in what}
     return [f"these runs were made with {n} {what[column]}" for column, n in kinds.items() if n > 1]
 

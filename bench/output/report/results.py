@@ -1,4 +1,4 @@
-"""What lies in a result folder beside its runs, and how a folder is found."""
+"""The files of a result folder beside its runs, and how to find a folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ...results.summary import Record, records
 
 PLAN = "experiment.yaml"
 NAMES = ("log", "label", "output", "baseline_log", "baseline_label", "baseline_output", "score")
-"""Columns of paired.csv that are text, whatever it looks like."""
+"""Columns of paired.csv that are text, even if they look like numbers."""
 
 
 def find_result(name: str, results: Path = Path("results")) -> Path:
@@ -27,7 +27,7 @@ def find_result(name: str, results: Path = Path("results")) -> Path:
         try:
             if (folder / "runs.sqlite").is_file():
                 return folder
-        except (OSError, ValueError):  # too long for a name, or no text for one
+        except (OSError, ValueError):  # not a possible file name
             continue
     known = sorted(path.parent.name for path in results.glob("*/runs.sqlite"))
     found = f"(in {results}: {', '.join(known)})" if known else f"(none in {results}; `fathom run` makes them)"
@@ -35,7 +35,7 @@ def find_result(name: str, results: Path = Path("results")) -> Path:
 
 
 def keep_plan(plan: Experiment, folder: Path) -> None:
-    """Write an experiment beside its runs, every estimator and log by itself, such that `fathom run` takes it.
+    """Write an experiment beside its runs, with every variant spelled out; `fathom run` accepts the file.
 
     Raises:
         ExperimentError: it cannot be written.
@@ -48,18 +48,18 @@ def keep_plan(plan: Experiment, folder: Path) -> None:
 
 
 def kept_plan(folder: Path, name: str) -> tuple[Experiment | None, str | None]:
-    """Return what was asked, and what `fathom run` calls it: what `keep_plan` left, else the shipped one of this name.
+    """Return the plan of a result folder, and how to name it to `fathom run`; (None, None) if it is not known.
 
-    None, None where nobody knows.
+    It is what `keep_plan` wrote, else the packaged experiment of this name.
     """
-    kept, shipped = _load(folder / PLAN), _load(name) if name in shipped_experiments() else None
-    if shipped is not None and (kept is None or plain(kept) == plain(shipped)):
-        return shipped, name
+    kept, packaged = _load(folder / PLAN), _load(name) if name in shipped_experiments() else None
+    if packaged is not None and (kept is None or plain(kept) == plain(packaged)):
+        return packaged, name
     return (None, None) if kept is None else (kept, str(folder / PLAN))
 
 
 def _load(source: str | Path) -> Experiment | None:
-    """Return an experiment; None where there is none, or another version wrote it."""
+    """Return an experiment; None if there is none, or if another version wrote it."""
     try:
         return Experiment.load(source)
     except ExperimentError:
@@ -67,9 +67,9 @@ def _load(source: str | Path) -> Experiment | None:
 
 
 def in_order(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
-    """Return the rows of a store in the order of the experiment's logs, estimators and seeds, as figures colour them.
+    """Return the rows of a store in the order of the experiment's logs, seeds and estimators, as figures colour them.
 
-    What an earlier experiment of this name left, with other labels or logs, goes last.
+    Rows of labels and logs that the experiment no longer has go last.
     """
     plan, _ = kept_plan(folder, str(rows["experiment"].iloc[0]))
     known = ([log.name for log in plan.logs], [each.label for each in plan.estimators]) if plan else ([], [])
@@ -82,7 +82,7 @@ def in_order(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
 
 
 def differences_of(folder: Path) -> list[Record]:
-    """Return what `fathom run` left of `paired` in a result folder; nothing where there is none.
+    """Return the paired differences that `fathom run` wrote to a result folder; none if there is no such file.
 
     Raises:
         ExperimentError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""What was run: how it ended, from which spec, where and with what."""
+"""What was run: how it ended, from which spec, where and by which versions."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 
 from ...metrics.floor_ratio import FLOORS
 from ...metrics.scoring import COSTS, INNOVATIONS, SCORES
-from ...results.summary import Record, groups
-from .sheets import Cell, Line, Sheet
+from ...results.summary import UNFINISHED, Record, groups
+from ..cells import ABSENT, Cell, against, spans
+from ..sheets import Line, Sheet
 
 ALL_SCORES = (*SCORES, *FLOORS, *INNOVATIONS, *COSTS)
-ENDS = ("done", "diverged", "failed", "absent")
+ENDS = ("done", *UNFINISHED)
 
 
 def each_run(rows: Sequence[Record]) -> list[Record]:
@@ -21,37 +22,26 @@ def each_run(rows: Sequence[Record]) -> list[Record]:
 
 
 def facts(rows: Sequence[Record]) -> list[tuple[str, str]]:
-    """Return what the page says in a line: how many runs ended how, on what, scored how."""
+    """Return the facts below the title: how many runs ended how, on which logs and seeds, scored how."""
     runs = each_run(rows)
     ends = {end: sum(row["status"] == end for row in runs) for end in ENDS}
-    said = [f"{count} {end}" for end, count in ends.items() if count or end == "done"]
+    counts = [f"{count} {end}" for end, count in ends.items() if count or end == "done"]
     seeds = sorted({int(row["seed"]) for row in runs if row["seed"] is not None})
     scored = [row for row in rows if row["truth_kind"] is not None]
     logs, labels = groups(runs, "log"), groups(runs, "label")
     found = [
-        ("runs", f"{len(runs)}: {', '.join(said)}"),
+        ("runs", f"{len(runs)}: {', '.join(counts)}"),
         ("logs", str(len(logs)) if len(logs) > 1 else next(iter(logs))[0]),
         ("estimators", str(len(labels))),
         ("seeds", spans(seeds) or "none: recorded logs only"),
-        ("alignment", ", ".join(dict.fromkeys(str(row["align"]) for row in scored)) or "nothing to score against"),
+        ("alignment", ", ".join(dict.fromkeys(str(row["align"]) for row in scored)) or "no ground truth"),
     ]
     kinds = dict.fromkeys(row["truth_kind"] for row in scored)
-    return [*found, ("against", ", ".join(f"a {kind}" if kind != "truth" else "the truth" for kind in kinds) or "–")]
-
-
-def spans(numbers: Sequence[int]) -> str:
-    """Return sorted integers with what follows on each other in one piece: "1–20, 25"."""
-    pieces: list[list[int]] = []
-    for number in numbers:
-        if pieces and number == pieces[-1][-1] + 1:
-            pieces[-1].append(number)
-        else:
-            pieces.append([number])
-    return ", ".join(f"{piece[0]}–{piece[-1]}" if len(piece) > 1 else f"{piece[0]}" for piece in pieces)
+    return [*found, ("against", ", ".join(map(against, kinds)) or ABSENT)]
 
 
 def failures(rows: Sequence[Record]) -> Sheet | None:
-    """Return the runs that did not come to their end, each cause once; None where all did."""
+    """Return the runs that did not finish, each cause once; None where all did."""
     lost = [row for row in each_run(rows) if row["status"] != "done"]
     if not lost:
         return None
@@ -59,31 +49,28 @@ def failures(rows: Sequence[Record]) -> Sheet | None:
     for (log, label, status, cause), of in groups(lost, "log", "label", "status", "cause").items():
         seeds = sorted(int(row["seed"]) for row in of if row["seed"] is not None)
         times = sorted(row["failed_at_s"] for row in of if row["failed_at_s"] is not None)
-        when = " to ".join(dict.fromkeys(f"{t:.1f}" for t in times[:: max(len(times) - 1, 1)])) or "–"
+        when = " to ".join(dict.fromkeys(f"{t:.1f}" for t in times[:: max(len(times) - 1, 1)])) or ABSENT
         cells = [
             Cell(label, label),
-            Cell(spans(seeds) or "–", seeds[0] if seeds else None),
+            Cell(spans(seeds) or ABSENT, seeds[0] if seeds else None),
             Cell(str(status), str(status)),
             Cell(when, times[0] if times else None),
             Cell(cause or "no cause is recorded", cause),
         ]
         lines.append(Line(log, cells))
-    return Sheet("By log, estimator and cause", [], ["log", *LOST], {"": lines})
-
-
-LOST = ["estimator", "seeds", "ended", "at, s", "cause"]
+    return Sheet("By log, estimator and cause", [], ["log", "estimator", "seeds", "status", "at, s", "cause"], lines)
 
 
 def environments(rows: Sequence[Record]) -> list[dict[str, Any]]:
-    """Return where runs were made and with what: commit, versions, machine, and how many runs that were."""
+    """Return by which commit, versions and machine runs were made, and how many."""
     return [
         {
             "runs": len(of),
             "commit": commit or "not recorded",
             "versions": _loads(versions),
             "machine": _loads(machine),
-            "first": min((row["finished"] for row in of if row["finished"]), default="–"),
-            "last": max((row["finished"] for row in of if row["finished"]), default="–"),
+            "first": min((row["finished"] for row in of if row["finished"]), default=ABSENT),
+            "last": max((row["finished"] for row in of if row["finished"]), default=ABSENT),
         }
         for (commit, versions, machine), of in groups(each_run(rows), *PLACE).items()
     ]
@@ -93,7 +80,7 @@ PLACE = ("commit_id", "versions", "machine")
 
 
 def details(rows: Sequence[Record]) -> dict[str, Any]:
-    """Return what the page's script opens under each row; specs (but for the seed) and places are there once."""
+    """Return what the page's script opens under each row; specs (without the seed) and places are there once."""
     specs: dict[str, int] = {}
     places: dict[tuple[Any, ...], int] = {}
     each = []
@@ -117,7 +104,7 @@ def details(rows: Sequence[Record]) -> dict[str, Any]:
                 "trajectory": row["trajectory"],
                 "counts": _loads(row["counts"]),
                 "notes": _loads(row["notes"]),
-                "scores": [row[name] for name in ALL_SCORES],
+                "scores": [None if row[name] is None else str(row[name]) for name in ALL_SCORES],
             }
         )
     return {

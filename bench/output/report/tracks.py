@@ -14,15 +14,15 @@ from pyarrow.parquet import read_metadata
 from ....datasets.errors import one_line
 from ....datasets.state import POSITION, Array
 from ...results.summary import Record, groups
-from ..figures.track import Track, tracks_of
-from .sheets import lookahead
+from ..figures.track import Track, error_m, has_bounds, is_near, tracks_of
+from .curves import named
 
 POSES = 200_000
-"""How many poses a page may hold; one is 48 bytes of it."""
+"""Poses that a page may hold, 48 bytes each: some 10 MB."""
 OF_A_TRACK = (2000, 1000, 500, 200)
-"""How many poses of one track are drawn: the first for which one seed of each log has room, and the last anyhow."""
+"""Poses drawn of one track: the most for which one seed of each log has room, else the least of these."""
 MOST_SEEDS = 10
-"""How many seeds of a log are drawn at most: nobody looks at hundreds, and reading them takes its time."""
+"""Seeds of a log that are drawn at most: more take long to read, and are too many to look through."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Drawn:
     """What is drawn of one log.
 
     Attributes:
-        seeds: what the page's script is given, by seed; None for a recorded log.
+        seeds: what the page's script reads, by seed; the seed of a recorded log is None.
         every: one pose in so many is shown.
         poses: how many the longest track has.
         left_out: how many seeds are not drawn.
-        missing: trajectories that rows speak of and that cannot be read, and why.
+        missing: trajectories that cannot be read, and why.
     """
 
     seeds: dict[int | None, Any] = field(default_factory=dict)
@@ -45,7 +45,7 @@ class Drawn:
 
 
 def draw_all(rows: Sequence[Record], folder: Path) -> dict[str, Drawn]:
-    """Read of each log as many seeds as the page has room for: first those with a run that did not come to its end.
+    """Read as many seeds of each log as the page has room for; seeds with a run that did not finish come first.
 
     Args:
         rows: of the store.
@@ -88,14 +88,14 @@ def _draw(by_seed: Mapping[int | None, Sequence[Record]], folder: Path, most: in
 
 
 def _read(row: Record, folder: Path, missing: list[str]) -> Track | None:
-    """Return the track of a row; None where there is none to compare, or after adding to `missing` what is wrong."""
+    """Return the track of a row; None if it has no score, or if it cannot be read, which is added to `missing`."""
     for name in (row["trajectory"], row["truth_trajectory"]):
         if name is not None and not (folder / name).is_file():
             missing.append(f"{name}: not there")
             return None
     try:
         tracks, _ = tracks_of([row], folder)
-    except (OSError, ValueError, KeyError) as error:  # a file that was cut off, or is none of ours
+    except (OSError, ValueError, KeyError) as error:  # a truncated file, or not one of ours
         missing.append(f"{row['trajectory']}: {one_line(error)}")
         return None
     return tracks[0] if tracks else None
@@ -110,10 +110,8 @@ def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]
         "truth": None if longest is None else _coordinates(longest.p_WB_W[::every, :2]),
         "tracks": [
             {
-                "label": track.label,
-                "output": track.output,
-                "ahead": lookahead(row),
-                "near": _is_near(track),
+                **named(row),
+                "near": is_near(track),
                 "t": floats(1e-9 * (track.estimate.t_ns[::every] - start_ns).astype(float)),
                 "p": _coordinates(track.estimate.p_WB_W[::every, :2]),
                 "error": _errors(track, every),
@@ -124,24 +122,17 @@ def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]
     }
 
 
-def _is_near(track: Track) -> bool:
-    """Whether a track keeps within the truth's own extent of it: one that got lost does not set a figure's scale."""
-    if track.truth is None:
-        return True
-    error_m = (track.estimate.p_WB_W - track.truth.p_WB_W)[:, :2]
-    return bool(np.nanmax(np.abs(error_m), initial=0.0) < max(np.ptp(track.truth.p_WB_W[:, :2], axis=0).max(), 1.0))
-
-
 def _errors(track: Track, every: int) -> list[str] | None:
     if track.truth is None:
         return None
-    return _coordinates(track.estimate.p_WB_W[::every] - track.truth.p_WB_W[::every])
+    return _coordinates(error_m(track)[::every])
 
 
 def _sigmas(track: Track, every: int) -> list[str] | None:
     """Return σ by axis; None where there is no covariance, or it is in other axes than the aligned error."""
-    if track.align != "none" or track.estimate.P is None or track.truth is None:
+    if not has_bounds(track):
         return None
+    assert track.estimate.P is not None
     variance = np.diagonal(track.estimate.P[::every, POSITION, POSITION], axis1=1, axis2=2)
     return _coordinates(np.sqrt(variance.clip(min=0)))
 

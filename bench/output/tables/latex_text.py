@@ -1,4 +1,4 @@
-"""Any text as LaTeX that pdflatex sets without a package, whatever somebody called a log or an estimator."""
+"""Escape any text for LaTeX, such as the names of logs and estimators; pdflatex needs no package for it."""
 
 from __future__ import annotations
 
@@ -73,12 +73,13 @@ ALPHABET = (
 CAPITALS = "Gamma Delta Theta Lamda Xi Pi Sigma Upsilon Phi Psi Omega"
 GREEK = {f"SMALL LETTER {name.upper()}": name.replace("lamda", "lambda") for name in ALPHABET.split()}
 GREEK |= {f"CAPITAL LETTER {name.upper()}": name.replace("Lamda", "Lambda") for name in CAPITALS.split()}
-"""By Unicode's names, less "GREEK"; of the capitals LaTeX has those alone that differ from Latin letters."""
+"""By Unicode's names, without "GREEK"; LaTeX has only those capitals that differ from Latin letters."""
 
 
 def escape(text: str) -> str:
-    """Return a text as LaTeX shows it as it stands; a letter that it has no sign for is named by its code, [U+6771]."""
-    return re.sub("-(?=-)", "-{}", "".join(_escape(letter) for letter in " ".join(text.split())))  # two are no dash
+    """Escape a text for LaTeX; a letter that LaTeX has no command for is shown by its code, [U+6771]."""
+    escaped = "".join(_escape(letter) for letter in " ".join(text.split()))
+    return re.sub("-(?=-)", "-{}", escaped)  # two hyphens would become a dash
 
 
 def _escape(letter: str) -> str:

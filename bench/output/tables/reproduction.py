@@ -1,4 +1,4 @@
-"""What came of running stored runs again, on the terminal."""
+"""What running stored runs again gave, on the terminal."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from rich.table import Table
 from rich.text import Text
 
 from ...execution.reproduce import Again, Difference, Value, changed_facts
+from ..cells import ABSENT
 from . import terminal
 
-ABSENT = "–"
 WIDEST = 44
-"""Of a value in a cell."""
-HEADINGS = ("said", "runs", "verdict", "then", "now", "difference", "relative")
+"""Letters of a value in a cell: two such and a name fit 120 columns."""
+HEADINGS = ("output", "runs", "verdict", "then", "now", "difference", "relative")
 
 ROUNDING = (
-    "versions or kind of machine differ, so sums are rounded otherwise: expect relative differences of some 1e-10, "
-    "more only where they tip a threshold (a gate, a relinearisation); see docs/reproduce.md"
+    "versions or kind of machine differ, so sums are rounded differently: expect relative differences of about 1e-10, "
+    "more only where rounding tips a threshold (a gate, a relinearisation); see docs/reproduce.md"
 )
-CODE = "the code is not what it was: differences of any size may be meant; the commits between tell"
-SAME = "code, versions and kind of machine are the same: so are the scores, bit for bit, or something is wrong"
+CODE = "the code has changed: differences of any size may be intended; see the commits in between"
+SAME = "code, versions and kind of machine are the same, so the scores must be identical, bit for bit"
 
 
 def print_reproduction(every: Sequence[Again], console: Console | None = None) -> None:
-    """Print what is not as it was, a verdict per estimator and output, what could not be run, and the sum of it.
+    """Print what has changed, a verdict per estimator and output, what could not be run, and the total.
 
     Of a single run every score that differs is listed; of several the one that differs most in each group.
     """
@@ -43,7 +43,7 @@ def print_reproduction(every: Sequence[Again], console: Console | None = None) -
 
 
 def _print_facts(run: Sequence[Again], console: Console) -> None:
-    """Print what of code, versions and machine is not as it was, and what that lets one expect."""
+    """Print what has changed in code, versions and machine, and which differences to expect from that."""
     counts = Counter((fact.name, fact.then, fact.now) for again in run for fact in changed_facts(again.stored))
     if counts:
         table = _empty("made with", ("then", "now", "runs"))
@@ -59,7 +59,7 @@ def _print_facts(run: Sequence[Again], console: Console) -> None:
 
 
 def _verdicts(run: Sequence[Again], most: int | None) -> Table:
-    """Return a row per log, label and output where all is identical, else one for each of the `most` worst scores."""
+    """Return a row per log, label and output if all is identical, else one for each of the `most` worst scores."""
     table = _empty("log / label", HEADINGS)
     grouped: dict[tuple[str, str], list[Again]] = {}
     for again in sorted(run, key=lambda again: again.stored.group):
@@ -82,7 +82,7 @@ def _verdicts(run: Sequence[Again], most: int | None) -> Table:
 
 
 def _listed(worst: Sequence[tuple[Difference, Again]]) -> list[tuple[Difference, Again]]:
-    """Return the differences but for those of the NEES at fixed times, of which the first is enough."""
+    """Return the differences; of those of the NEES at fixed times only the first."""
     at_times = [pair for pair in worst if pair[0].name.startswith("nees_at.")]
     return [pair for pair in worst if pair not in at_times[1:]]
 
@@ -94,16 +94,16 @@ def _difference(each: Difference) -> list[str]:
 
 
 def _sentences(every: Sequence[Again]) -> list[str]:
-    """Return what is to be said of single runs, and the sum."""
-    told = [(remark, again.stored.name) for again in every for remark in again.remarks]
-    told += [(f"not run again: {again.skipped}", again.stored.name) for again in every if again.skipped is not None]
+    """Return the remarks about single runs, and the total."""
+    remarks = [(remark, again.stored.name) for again in every for remark in again.remarks]
+    remarks += [(f"not run again: {again.skipped}", again.stored.name) for again in every if again.skipped is not None]
     names: dict[str, list[str]] = {}
-    for sentence, name in told:
+    for sentence, name in remarks:
         names.setdefault(sentence, []).append(name)
     lines = [f"{_several(of)}: {sentence}" for sentence, of in names.items()]
     run = [again for again in every if again.skipped is None]
     ratios = [again.time_ratio for again in run if again.time_ratio is not None]
-    took = f"; computing took {median(ratios):.2f} times as long (median), which is not compared" if ratios else ""
+    took = f"; computing took {median(ratios):.2f} times as long (median), which does not count" if ratios else ""
     same = sum(again.is_identical for again in run)
     lines.append(f"{same} of {len(run)} runs came out identical, bit for bit{took}")
     return lines
@@ -117,7 +117,7 @@ def _empty(first: str, headings: Sequence[str]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column(first, overflow="fold", min_width=14)
     for heading in headings:
-        table.add_column(heading, overflow="fold", justify="left" if heading in ("said", "verdict") else "right")
+        table.add_column(heading, overflow="fold", justify="left" if heading in ("output", "verdict") else "right")
     return table
 
 

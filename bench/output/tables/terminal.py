@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 WIDTH = 120
+"""Columns of output to a file or a pipe: enough for the tables of README."""
 
 
 def console() -> Console:

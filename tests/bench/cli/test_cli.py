@@ -44,6 +44,7 @@ def circle(errors_m: float = 0.0) -> Trajectory:
     return Trajectory(np.arange(200) * 10**9, np.repeat(np.eye(3)[None], 200, axis=0), p + np.array([errors_m, 0, 0]))
 
 
+@pytest.mark.slow
 def test_run_writes_store_table_and_figures_and_prints_the_table(tmp_path: Path) -> None:
     code, out, _ = call("run", write(tmp_path), "--out", tmp_path / "r", "--jobs", 2)
     assert code == 0
@@ -57,6 +58,7 @@ def test_run_writes_store_table_and_figures_and_prints_the_table(tmp_path: Path)
     assert len(list((folder / "figures").glob("*.pdf"))) == 5
 
 
+@pytest.mark.slow
 def test_a_failed_run_is_named_on_the_last_line_and_exits_1(tmp_path: Path) -> None:
     code, out, _ = call("run", write(tmp_path, timeout_s="1.0e-6"), "--out", tmp_path, "--only", "eskf")
     assert code == 1
@@ -64,6 +66,7 @@ def test_a_failed_run_is_named_on_the_last_line_and_exits_1(tmp_path: Path) -> N
     assert "out of time" in out.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_not_here_is_said_plainly(tmp_path: Path) -> None:
     logs = "[{scenario: {duration_s: 20}}, {log: ictineu_stpere_2004}]"
     file = write(tmp_path, logs=logs, estimators="[{name: dead-reckoning}]")
@@ -85,6 +88,7 @@ def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(
     assert "its rows are from an earlier run" in err
 
 
+@pytest.mark.slow
 def test_only_after_a_change_leaves_what_is_outdated_out_of_the_csv(tmp_path: Path) -> None:
     assert call("run", write(tmp_path), "--out", tmp_path, "--jobs", 2)[0] == 0
     changed = write(tmp_path, scores="{rpe_delta: 5.0}")
@@ -94,6 +98,7 @@ def test_only_after_a_change_leaves_what_is_outdated_out_of_the_csv(tmp_path: Pa
     assert "1 rows of another spec or version are left out" in err
 
 
+@pytest.mark.slow
 def test_only_leaves_the_others_in_the_csv(tmp_path: Path) -> None:
     file = write(tmp_path)
     assert call("run", file, "--out", tmp_path, "--jobs", 2)[0] == 0
@@ -166,6 +171,7 @@ def test_list_names_what_there_is() -> None:
     assert call("list", "fish")[0] == 2
 
 
+@pytest.mark.slow
 def test_a_simulated_folder_runs_like_any_log(tmp_path: Path) -> None:
     (tmp_path / "dive.yaml").write_text("{mission: yo-yo, duration_s: 20}\n")
     code, out, _ = call("simulate", tmp_path / "dive.yaml", "-o", tmp_path / "dive", "--seed", 5)
@@ -236,6 +242,7 @@ def test_ctrl_c_is_one_line_and_status_130(verb: str, tmp_path: Path, monkeypatc
     assert err.splitlines()[-1].startswith("interrupted")
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_finished_runs_and_exits_130(tmp_path: Path) -> None:
     labels = ", ".join(f"{{name: dead-reckoning, label: n{k}}}" for k in range(200))
     file = write(tmp_path, estimators=f"[{labels}]", logs="[{scenario: {duration_s: 300}}]")

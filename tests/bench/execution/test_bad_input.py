@@ -1,4 +1,4 @@
-"""Whatever a log lacks or garbles, every estimator ends with a result that says so (DESIGN, section 9).
+"""Whatever a log lacks or garbles, every estimator ends with a result that says so.
 
 Everything here is asked of all of ESTIMATORS, so a new one is asked as well. Dead reckoning has no covariance, listens
 to neither GPS nor accelerometer, and holds what it heard last: where that makes a difference, the test says so.

@@ -209,6 +209,7 @@ def test_a_run_that_takes_its_workers_along_is_a_failed_row_and_the_rest_is_done
     assert_nothing_is_left(client)
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_takes_the_rest_off_the_cluster(
     client: Client, scheduler: str, tmp_path: Path
 ) -> None:
@@ -236,6 +237,7 @@ def test_ctrl_c_keeps_what_is_finished_and_takes_the_rest_off_the_cluster(
     assert (finished["status"] == "done").all()
 
 
+@pytest.mark.slow
 def test_a_worker_that_computes_with_something_else_is_refused_by_name_before_anything_runs(
     client: Client, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +249,7 @@ def test_a_worker_that_computes_with_something_else_is_refused_by_name_before_an
     assert_nothing_is_left(client)
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_another_one_over_there_is_a_failed_row(
     client: Client, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,6 +260,7 @@ def test_a_recording_that_is_another_one_over_there_is_a_failed_row(
     assert "DatasetError: dive: the recording on" in rows["cause"].iloc[0]
 
 
+@pytest.mark.slow
 def test_the_command_runs_on_a_cluster_of_its_own(tmp_path: Path, site: Path) -> None:
     file = tmp_path / "e.yaml"
     file.write_text(json.dumps({"logs": [SHORT], "estimators": [{"name": "dead-reckoning"}], "seeds": 2}))
@@ -354,6 +358,7 @@ def test_recordings_are_sought_where_the_worker_has_them(tmp_path: Path, monkeyp
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_commands_have() -> None:
     page = PAGE.read_text(encoding="utf-8")
     known = {

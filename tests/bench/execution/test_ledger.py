@@ -184,10 +184,10 @@ def test_progress_goes_to_a_log_file_by_lines(
     tmp_path: Path, ran: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(runner, "LINE_EVERY_S", -1.0)
-    run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path)
     assert capsys.readouterr().err.splitlines()[-2:] == [
-        "1 of 2 runs finished; the last: lawnmower-tactical / dead-reckoning: done",
-        "2 of 2 runs finished; the last: lawnmower-tactical / dead-reckoning: done",
+        "1 of 3 runs finished; the last: lawnmower-tactical / dead-reckoning: done",
+        "2 of 3 runs finished; the last: lawnmower-tactical / dead-reckoning: done",
     ]
 
 

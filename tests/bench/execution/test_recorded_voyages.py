@@ -6,26 +6,14 @@ yaw-aligned over 56 minutes; LAUV 1.35 m RMS against the vehicle's own filter), 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from fathom.bench.execution.drive import run_log
 from fathom.bench.metrics import ate
-from fathom.datasets import Log, open_log
+from fathom.datasets import Log
 from fathom.estimators import create
 
 ESTIMATORS = [("eskf", {}), ("fls", {"lag_s": 3.0}), ("fls", {"lag_s": 3.0, "dvl": ["preintegrated-loose"]})]
-
-
-@pytest.fixture(scope="module")
-def ictineu(recorded_data: Path) -> Log:
-    return open_log("ictineu_stpere_2004", data=recorded_data)
-
-
-@pytest.fixture(scope="module")
-def lauv(recorded_data: Path) -> Log:
-    return open_log("lauv_noptilus2_2015", data=recorded_data)
 
 
 @pytest.mark.slow

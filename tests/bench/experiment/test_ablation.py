@@ -12,9 +12,9 @@ from fathom.bench.cli.app import app
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution.task import Task
 from fathom.bench.execution.worker import WorkerCache
-from fathom.bench.experiment.comparison import Comparison
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.experiment.variants import changed, named_axes, points
+from fathom.bench.metrics.comparison import Comparison
 from fathom.bench.output.figures.ablation import draw_ablation
 from fathom.bench.output.figures.drawing import PALETTE, looks_of, save
 from fathom.datasets import Log
@@ -371,7 +371,7 @@ def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(
         "fathom.bench.execution.sweep.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks)
     )
-    monkeypatch.setattr("fathom.bench.output.present.draw_figures", lambda rows, folder, differences: [])
+    monkeypatch.setattr("fathom.bench.output.figures.figures.draw_figures", lambda rows, folder, differences: [])
     only = ["run", str(folder.parent / "small.yaml"), "--out", str(folder.parent), "--only", "l heard/eskf no gps"]
     result = CliRunner().invoke(app, only)
     assert result.exit_code == 0, result.output

@@ -17,9 +17,9 @@ from fathom.bench.execution.sweep import run_experiment
 from fathom.bench.execution.worker import work
 from fathom.bench.experiment.packaged import shipped_experiments
 from fathom.bench.experiment.plan import Experiment
-from fathom.bench.output.tables.table import failures
+from fathom.bench.output.remarks import failures
 from fathom.bench.results.store import load_runs
-from fathom.bench.results.summary import summarise
+from fathom.bench.results.summary import records, summarise
 from fathom.estimators import create
 
 SHORT = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
@@ -231,7 +231,7 @@ def test_mishaps_are_rows_and_the_others_go_on(tmp_path: Path, mishap: None) -> 
     assert absent["status"].tolist() == ["absent"] * 4
     assert all("not here" in cause for cause in absent["cause"])
     assert len(load_runs(tmp_path / "out" / "t")) == len(rows)
-    lines = failures(rows)
+    lines = failures(records(rows))
     assert len(lines) == 7
     assert lines[0] == "lawnmower-tactical / dies seed 1: failed: worker died (exit code 3)"
     summary = {(row["log"], row["label"]): row for row in summarise(rows)}

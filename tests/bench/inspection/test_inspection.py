@@ -21,8 +21,8 @@ from fathom.bench.inspection.streams.allan import FLICKER, allan_deviation, bias
 from fathom.bench.inspection.streams.channels import channels_of
 from fathom.bench.inspection.streams.neighbours import noise_sigma, outliers, residuals
 from fathom.bench.inspection.streams.norms import gyro_against_gravity, levelled
+from fathom.bench.inspection.streams.quantisation import quantisation_of
 from fathom.bench.inspection.streams.static import rests
-from fathom.bench.inspection.streams.steps import steps_of
 from fathom.datasets import Log
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, ImuStream, ReadingStream
@@ -52,8 +52,8 @@ def wrong(log: Log) -> list[Finding]:
 
 def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str) -> Finding:
     """The one finding of a stream that says these words."""
-    found = [finding for finding in findings if finding.stream == stream and words in finding.says]
-    assert len(found) == 1, [finding.says for finding in findings]
+    found = [finding for finding in findings if finding.stream == stream and words in finding.message]
+    assert len(found) == 1, [finding.message for finding in findings]
     return found[0]
 
 
@@ -78,7 +78,7 @@ def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str)
 )
 def test_nothing_looks_wrong_in_a_clean_log(keys: dict[str, Any], seed: int) -> None:
     inspection = inspect_log(simulated(seed, **keys))
-    assert [finding.says for finding in inspection.findings] == []
+    assert [finding.message for finding in inspection.findings] == []
 
 
 def test_nothing_looks_wrong_in_a_full_attitude() -> None:
@@ -106,7 +106,7 @@ FAULTS: list[tuple[str, dict[str, Any], str]] = [
     ("dvl", {"dropout_probability": 0.15}, "readings are missing"),
     ("dvl", {"outages_s": [[40, 60]]}, "silence of more than 5 s; the longest is 20.4 s, from 39.8 s"),
     ("dvl", {"outlier_probability": 0.02}, "stand out of their neighbours"),
-    ("dvl", {"repeat_probability": 0.05}, "say exactly what the one before said"),
+    ("dvl", {"repeat_probability": 0.05}, "equal the one before exactly"),
     ("dvl", {"limit_m_s": 1.52}, "dvl x is clipped"),
     ("dvl", {"limit_m_s": 1.2}, "dvl x is 1.2 m/s in every row"),
     ("dvl", {"quantum_m_s": 0.1}, "take only 3 values"),
@@ -114,17 +114,17 @@ FAULTS: list[tuple[str, dict[str, Any], str]] = [
     ("depth", {"dropout_probability": 0.15}, "readings are missing"),
     ("depth", {"outages_s": [[80, 100]]}, "silence of more than 5 s; the longest is 20.1 s, from 79.9 s"),
     ("depth", {"outlier_probability": 0.02}, "stand out of their neighbours"),
-    ("depth", {"repeat_probability": 0.05}, "say exactly what the one before said"),
+    ("depth", {"repeat_probability": 0.05}, "equal the one before exactly"),
     ("depth", {"limit_m": 15.0}, "depth is clipped"),
     ("depth", {"quantum_m": 0.5}, "comes in steps of 0.5 m"),
     ("depth", {"quantum_m": 5.0}, "takes only 4 values"),
     ("gps", {"outlier_probability": 0.05}, "stand out of their neighbours"),
-    ("gps", {"repeat_probability": 0.2}, "say exactly what the one before said"),
+    ("gps", {"repeat_probability": 0.2}, "equal the one before exactly"),
     ("gps", {"quantum_m": 10.0}, "comes in steps of 10 m"),
     ("heading", {"dropout_probability": 0.15}, "readings are missing"),
     ("heading", {"outages_s": [[0, 20]]}, "silence of more than 5 s; the longest is 20.2 s, from 0.0 s"),
     ("heading", {"outlier_probability": 0.02}, "stand out of their neighbours"),
-    ("heading", {"repeat_probability": 0.05}, "say exactly what the one before said"),
+    ("heading", {"repeat_probability": 0.05}, "equal the one before exactly"),
     ("heading", {"quantum_deg": 5.0}, "comes in steps of 5 °"),
 ]
 
@@ -145,15 +145,15 @@ def test_what_coarse_steps_bring_about_is_no_mark_and_no_row_without_reading(fau
     """A heading that rests on a step far from the others' median, and a gyro that now and then rounds to zero."""
     findings = wrong(simulated(duration_s=120, surface_for_s=100, **faults))
     assert len(findings) == 1
-    assert "comes in steps" in findings[0].says
+    assert "comes in steps" in findings[0].message
 
 
 @pytest.mark.parametrize("words", ["repeat_probability", "outlier_probability"])
 def test_gyro_and_accelerometer_are_told_apart(words: str) -> None:
     findings = wrong(simulated(imu={"faults": {words: 0.02}}))
     assert [finding.stream for finding in findings] == ["imu", "imu"]
-    assert " gyro readings" in findings[0].says
-    assert " accel readings" in findings[1].says
+    assert " gyro readings" in findings[0].message
+    assert " accel readings" in findings[1].message
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_gyro_and_accelerometer_are_told_apart(words: str) -> None:
 def test_late_and_disordered_readings_are_told(keys: dict[str, Any], words: str) -> None:
     findings = wrong(simulated(dvl=keys))
     assert len(findings) == 1
-    assert words in said(findings, "dvl", "after they were true").says
+    assert words in said(findings, "dvl", "after they were true").message
 
 
 def test_overtaken_readings_are_counted_as_they_are() -> None:
@@ -171,12 +171,12 @@ def test_overtaken_readings_are_counted_as_they_are() -> None:
     assert log.dvl is not None
     came = log.dvl.received_ns
     overtaken = sum(bool((came[k + 1 :] < came[k]).any()) for k in range(len(came)))
-    assert f"and {overtaken} of {len(came)} were overtaken" in said(wrong(log), "dvl", "overtaken").says
+    assert f"and {overtaken} of {len(came)} were overtaken" in said(wrong(log), "dvl", "overtaken").message
 
 
 def test_a_slow_imu_is_told() -> None:
     assert len(wrong(simulated(imu={"rate_hz": 10.0}))) == 1
-    said(wrong(simulated(imu={"rate_hz": 10.0})), "imu", "The IMU gives 10 Hz")
+    said(wrong(simulated(imu={"rate_hz": 10.0})), "imu", "The IMU samples at 10 Hz")
 
 
 def test_stamps_of_reception_are_told_by_their_bunches() -> None:
@@ -186,7 +186,7 @@ def test_stamps_of_reception_are_told_by_their_bunches() -> None:
     t_ns = polled_ns + np.arange(len(read_ns)) % 7 * 30_000
     t_ns = np.maximum.accumulate(t_ns) + np.arange(len(t_ns))
     finding = said(wrong(dataclasses.replace(log, imu=dataclasses.replace(log.imu, t_ns=t_ns))), "imu", "in bunches")
-    assert "streams.imu.message.clock" in finding.mend
+    assert "streams.imu.message.clock" in finding.fix
 
 
 @pytest.mark.parametrize("scattered", [0.25, 0.4])
@@ -194,7 +194,7 @@ def test_a_jittering_imu_is_told(scattered: float) -> None:
     log, rng = simulated(), np.random.default_rng(2)
     off_ns = np.rint(rng.uniform(-0.45, 0.45, len(log.imu.t_ns)) * scattered / 0.4 * 1e7).astype(np.int64)
     imu = dataclasses.replace(log.imu, t_ns=log.imu.t_ns + off_ns)
-    findings = [f for f in wrong(dataclasses.replace(log, imu=imu)) if "stamped" in f.says]
+    findings = [f for f in wrong(dataclasses.replace(log, imu=imu)) if "stamped" in f.message]
     assert len(findings) == 1
 
 
@@ -217,15 +217,15 @@ def test_zeros_and_marks_of_invalid_rows_are_told_apart_and_kept_out_of_the_outl
     z[10:200:10] = 0.0
     z[15:200:20] = -32.768
     findings = wrong(with_dvl(log, z))
-    assert "19 of 500 rows" in said(findings, "dvl", "exactly zero on every axis").says
-    assert "10 rows of dvl hold -32.768 m/s" in said(findings, "dvl", "a mark of rows without").says
+    assert "19 of 500 rows" in said(findings, "dvl", "exactly zero on every axis").message
+    assert "10 rows of dvl hold -32.768 m/s" in said(findings, "dvl", "a mark of rows without").message
     assert len(findings) == 2
 
 
 def test_an_axis_that_is_always_zero_was_not_measured() -> None:
     log = simulated()
     findings = wrong(with_dvl(log, dvl_of(log).z * [1.0, 0.0, 0.0]))
-    assert [finding.says[:5] for finding in findings] == ["dvl y", "dvl z"]
+    assert [finding.message[:5] for finding in findings] == ["dvl y", "dvl z"]
 
 
 def test_a_sensor_that_never_changes_is_told() -> None:
@@ -248,7 +248,7 @@ def test_a_stretch_of_more_noise_is_told_with_its_time() -> None:
     z = dvl_of(log).z.copy()
     z[1000:1500] += 0.03 * rng.standard_normal((500, 3))
     finding = said(wrong(with_dvl(log, z)), "dvl", "times as noisy as usual")
-    assert "25% of the log, longest from 50 to 75 s" in finding.says
+    assert "25% of the log, longest from 50 to 75 s" in finding.message
 
 
 @pytest.mark.parametrize("sensor", ["dvl", "depth", "heading"])
@@ -268,10 +268,10 @@ def test_the_quantum_of_a_channel_is_the_one_it_was_rounded_to(seed: int) -> Non
     rng = np.random.default_rng(seed)
     quantum, offset = 10.0 ** rng.uniform(-4, 1), rng.uniform(-3, 3)
     x = np.cumsum(rng.standard_normal(500)) * quantum * 10.0 ** rng.uniform(0, 2)
-    steps = steps_of(np.rint(x / quantum) * quantum + offset)
+    steps = quantisation_of(np.rint(x / quantum) * quantum + offset)
     assert steps.quantum == pytest.approx(quantum, rel=1e-3)
-    assert steps_of(x).quantum == 0.0
-    assert steps_of(x.astype(np.float32).astype(float)).quantum < 1e-5 * quantum * 100
+    assert quantisation_of(x).quantum == 0.0
+    assert quantisation_of(x.astype(np.float32).astype(float)).quantum < 1e-5 * quantum * 100
 
 
 def test_white_noise_is_measured_from_the_values_alone() -> None:
@@ -295,8 +295,8 @@ def test_a_wrongly_stated_sigma_is_told_and_the_right_one_proposed(sensor: str, 
     if not finds:
         assert findings == []
         return
-    mend = said(findings, sensor, "scatters from reading to reading").mend.split(", if")[0]
-    path, value = mend.split(": ", 1)
+    fix = said(findings, sensor, "scatters from reading to reading").fix.split(", if")[0]
+    path, value = fix.split(": ", 1)
     shown = 180 / np.pi if sensor == "heading" else 1.0
     proposed = np.atleast_1d(np.array(yaml.safe_load(value), float)) / shown
     np.testing.assert_allclose(proposed, stream.sigma[0], rtol=0.3)
@@ -309,7 +309,7 @@ def test_a_wrongly_stated_imu_density_is_told_under_way(factor: float, words: st
     noise = log.rig.imu_noise
     off = dataclasses.replace(noise, gyro_density=noise.gyro_density * factor)
     findings = wrong(dataclasses.replace(log, rig=dataclasses.replace(log.rig, imu_noise=off)))
-    assert "gyro" in said(findings, "imu", words).says
+    assert "gyro" in said(findings, "imu", words).message
 
 
 # at rest
@@ -364,14 +364,14 @@ def test_a_steady_turn_or_way_through_the_water_is_no_rest() -> None:
 def test_the_gyro_bias_at_rest_is_told_where_it_is_beyond_what_is_stated() -> None:
     assert wrong(at_rest((1e-3, -2e-3, 0.5e-3))) == []
     finding = said(wrong(at_rest((1e-3, -8e-3, 0.5e-3))), "imu", "At rest the gyro reads (0.001")
-    assert finding.mend.startswith("streams.imu.noise.gyro_bias_sigma: 0.008")
+    assert finding.fix.startswith("streams.imu.noise.gyro_bias_sigma: 0.008")
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0])
 def test_a_wrongly_stated_density_is_told_at_rest_and_the_right_one_proposed(factor: float) -> None:
     stated = dataclasses.replace(NOISE, accel_density=NOISE.accel_density * factor)
     finding = said(wrong(at_rest(stated=stated)), "imu", "At rest the accel's white noise")
-    path, value = finding.mend.split(": ")
+    path, value = finding.fix.split(": ")
     assert path == "streams.imu.noise.accel_density"
     assert float(value) == pytest.approx(NOISE.accel_density, rel=0.15)
 
@@ -449,7 +449,7 @@ def rewritten(folder: Path, changes: dict[str, Any]) -> Path:
 
 def mended(folder: Path, finding: Finding) -> Path:
     """Do what a finding proposes."""
-    path, value = finding.mend.split(";")[0].split(" (")[0].split(": ", 1)
+    path, value = finding.fix.split(";")[0].split(" (")[0].split(": ", 1)
     proposed = yaml.safe_load(value)
     if path == "streams.imu.mounting":
         proposed |= {"R_BS": None}
@@ -485,12 +485,12 @@ def test_what_is_proposed_for_the_imu_mends_it(
     marred: dict[str, float], changes: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     folder = described(tmp_path / "log", marred, **changes)
-    findings = [f for f in wrong_in(folder) if words in f.says]
-    assert len(findings) == 1, [f.says for f in wrong_in(folder)]
-    mend = findings[0]
-    if "FRD" in mend.mend and "axes" in changes:
-        mend = dataclasses.replace(mend, mend="streams.imu.axes: FLU")
-    assert [f.says for f in wrong_in(mended(folder, mend))] == []
+    findings = [f for f in wrong_in(folder) if words in f.message]
+    assert len(findings) == 1, [f.message for f in wrong_in(folder)]
+    fix = findings[0]
+    if "FRD" in fix.fix and "axes" in changes:
+        fix = dataclasses.replace(fix, fix="streams.imu.axes: FLU")
+    assert [f.message for f in wrong_in(mended(folder, fix))] == []
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -551,8 +551,8 @@ def broken(folder: Path) -> Path:
 def test_what_opening_had_to_drop_is_found_and_only_that(tmp_path: Path) -> None:
     log, repairs = open_to_inspect(broken(tmp_path / "log"))
     findings = inspect_log(log, repairs).checks[0].findings
-    assert said(findings, "depth", "3 depth rows are not finite").mend.startswith("streams.depth.valid")
-    assert said(findings, "dvl", "2 dvl rows are out of order").mend.startswith("streams.dvl.time")
+    assert said(findings, "depth", "3 depth rows are not finite").fix.startswith("streams.depth.valid")
+    assert said(findings, "dvl", "2 dvl rows are out of order").fix.startswith("streams.dvl.time")
     again = write_folder(log, tmp_path / "again")
     assert any("(repair)" in note for note in open_to_inspect(again)[0].notes)
     assert open_to_inspect(again)[1] == ()  # its history tells of a repair, but there is nothing to repair
@@ -633,19 +633,19 @@ def naive(description: dict[str, Any], recording: Path, folder: Path) -> list[Fi
 
 def test_ictineu_without_its_corrections_shows_what_its_readme_tells(recorded_data: Path, tmp_path: Path) -> None:
     findings = naive(NAIVE_ICTINEU, recorded_data / "ictineu_stpere_2004", tmp_path)
-    said(findings, "imu", "The IMU gives 10 Hz")
-    assert said(findings, "imu", "points down in the body").mend.startswith("streams.imu.axes: FRD")
+    said(findings, "imu", "The IMU samples at 10 Hz")
+    assert said(findings, "imu", "points down in the body").fix.startswith("streams.imu.axes: FRD")
     mark = said(findings, "dvl", "84 rows of dvl hold 327.67 m/s")
-    assert 2.0 < float(mark.mend.rsplit(": ", 1)[1]) < 300.0
+    assert 2.0 < float(mark.fix.rsplit(": ", 1)[1]) < 300.0
     said(findings, "dvl", "stand out of their neighbours")
-    assert "to 29" in said(findings, "dvl", "times as noisy as usual").says  # the bad half hour is at its end
+    assert "to 29" in said(findings, "dvl", "times as noisy as usual").message  # the bad half hour is at its end
     said(findings, "depth", "takes only 2 values in 5045 rows")
     assert len(findings) == 6
 
 
 def test_lauv_by_its_host_clock_shows_what_its_readme_tells(recorded_data: Path, tmp_path: Path) -> None:
     findings = naive(NAIVE_LAUV, recorded_data / "lauv_noptilus2_2015", tmp_path)
-    assert "5.8%" in said(findings, "imu", "come in bunches").says  # 5.6 % are under 2 ms, a fifth
+    assert "5.8%" in said(findings, "imu", "come in bunches").message  # 5.6 % are under 2 ms, a fifth
     said(findings, "imu", "points down in the body")
     said(findings, "dvl", "49 of 497 rows of dvl are exactly zero")
     assert len(findings) == 3
@@ -725,7 +725,7 @@ def test_odd_logs_are_inspected_and_drawn(what: str) -> None:
 def test_noise_where_none_is_stated_is_told() -> None:
     log = simulated(imu="consumer")
     found = inspect_log(dataclasses.replace(log, rig=with_noise(log.rig, gyro_density=0.0))).findings
-    assert "where none is stated" in said(found, "imu", "white noise").says
+    assert "where none is stated" in said(found, "imu", "white noise").message
 
 
 @pytest.mark.parametrize("factor", [1e40, 1e200])
@@ -784,7 +784,7 @@ def test_the_figure_goes_where_it_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["nowhere"], "nowhere: no such log"),
         (["{log}", "-o", "{log}/page.jpg"], "one of .png, .pdf, .svg"),
@@ -792,14 +792,14 @@ def test_the_figure_goes_where_it_is_told(tmp_path: Path) -> None:
         (["{bad}"], "did you mean 'table'"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_2(arguments: list[str], says: str, tmp_path: Path) -> None:
+def test_bad_input_is_one_line_and_exit_2(arguments: list[str], message: str, tmp_path: Path) -> None:
     write_folder(simulated(), tmp_path / "log")
     (tmp_path / "bad.yaml").write_text("streams: {imu: {tabel: {file: x.csv}}}")
     filled = [argument.format(log=tmp_path / "log", bad=tmp_path / "bad.yaml") for argument in arguments]
     code, out, err = call(*filled)
     assert code == 2
     assert out == ""
-    assert says in err
+    assert message in err
     assert err.count("\n") == 1
 
 

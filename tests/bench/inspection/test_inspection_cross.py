@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from fathom.bench.inspection.between.answers import Delay
-from fathom.bench.inspection.between.clock import weigh
-from fathom.bench.inspection.between.cross import cross_checks
+from fathom.bench.inspection.between.clock import fit_clocks
+from fathom.bench.inspection.between.cross_checks import cross_checks
 from fathom.bench.inspection.between.fitting import Estimate, blocks_of, least_squares
 from fathom.bench.inspection.between.lever_arm import products
+from fathom.bench.inspection.between.pair_check import Delay
 from fathom.bench.inspection.findings.finding import Check, Finding
 from fathom.bench.output.figures.drawing import empty_figure
 from fathom.datasets import Log, Scenario, Trajectory, open_log, simulate
@@ -76,10 +76,10 @@ def some_fast(cases: dict[str, Any], count: int) -> list[Any]:
 OTHER = {"yaw": "compass", "compass": "yaw", "up": "down", "down": "up", "FRD": "FLU", "FLU": "FRD", "NED": "ENU"}
 
 
-def mend(file: Path, finding: Finding) -> None:
+def fix(file: Path, finding: Finding) -> None:
     """Put into a description what a finding proposes, as a reader would, on top of what stands there."""
     described = yaml.safe_load(file.read_text())
-    path, said = finding.mend.split(": ", 1)
+    path, said = finding.fix.split(": ", 1)
     text, _, remark = said.partition("#")
     value, now = yaml.safe_load(text), described
     for part in path.split("."):
@@ -132,7 +132,7 @@ def test_a_car_has_no_depth_no_heading_and_a_dvl_of_one_axis() -> None:
     assert abs(value - 1 / 1.03) < max(3 * sigma_of_it, 0.002)  # what was not measured is taken for zero
     (velocity,) = (check for check in checks if check.title == VELOCITY)
     assert [velocity.facts[f"DVL less truth, {axis}"] for axis in ("left", "up")] == ["not measured"] * 2
-    found = {finding.mend.split(": ")[0] for check in checks for finding in check.findings}
+    found = {finding.fix.split(": ")[0] for check in checks for finding in check.findings}
     assert found == {"streams.dvl.velocity.scale"}
 
 
@@ -230,7 +230,7 @@ def test_the_lever_arm_is_found_where_turning_excites_it(seed: int) -> None:
         assert abs(value - true) < 3 * sigma
         assert sigma < 0.05
     (finding,) = check.findings
-    assert finding.mend.startswith("streams.imu.mounting.translation_m: ")
+    assert finding.fix.startswith("streams.imu.mounting.translation_m: ")
 
 
 def test_a_steady_course_says_that_the_lever_arm_is_not_observable() -> None:
@@ -278,9 +278,9 @@ def test_what_a_finding_proposes_makes_it_vanish(written: Path, tmp_path: Path, 
     file.write_text((written / "log.yaml").read_text())
     rewrite(file, changes)
     found = findings(open_log(file, data=written))
-    proposed = {finding.mend: finding for finding in found if finding.mend.startswith(path)}
+    proposed = {finding.fix: finding for finding in found if finding.fix.startswith(path)}
     assert len(proposed) == 1, found
-    mend(file, *proposed.values())
+    fix(file, *proposed.values())
     assert findings(open_log(file, data=written)) == []
 
 
@@ -298,25 +298,25 @@ def naive(tmp_path: Path, data: Path, name: str, changes: dict[str, Any]) -> Log
 def test_the_declination_of_lauv_is_found(tmp_path: Path, recorded_data: Path) -> None:
     checks = cross_checks(naive(tmp_path, recorded_data, LAUV, {"streams.heading.add_deg": None}))
     (finding,) = (f for check in checks for f in check.findings if f.stream == "heading")
-    assert float(finding.mend.split(": ")[1].split()[0]) == pytest.approx(-2.6, abs=0.1)
+    assert float(finding.fix.split(": ")[1].split()[0]) == pytest.approx(-2.6, abs=0.1)
 
 
 def test_the_offset_of_lauvs_reference_height_is_found(tmp_path: Path, recorded_data: Path) -> None:
     z = {"truth.position": {"columns": ["x", "y", "z"], "unit": "m"}}
     log = naive(tmp_path, recorded_data, LAUV, z)
-    (finding,) = (f for f in findings(log) if f.mend.startswith("truth.position.offset"))
-    assert "reference" in finding.says
-    offset = yaml.safe_load(finding.mend.split(": ", 1)[1].split("#")[0])
+    (finding,) = (f for f in findings(log) if f.fix.startswith("truth.position.offset"))
+    assert "reference" in finding.message
+    offset = yaml.safe_load(finding.fix.split(": ", 1)[1].split("#")[0])
     np.testing.assert_allclose(offset, [0, 0, 57.547], atol=0.001)
     log = naive(tmp_path, recorded_data, LAUV, {**z, "truth.position.offset": offset})
-    assert not [f for f in findings(log) if "position.offset" in f.mend]
+    assert not [f for f in findings(log) if "position.offset" in f.fix]
 
 
 def test_lauvs_reference_does_not_climb_as_it_says(tmp_path: Path, recorded_data: Path) -> None:
     checks = cross_checks(naive(tmp_path, recorded_data, LAUV, {}))
     value, sigma = fact(checks, "reference against itself", "velocity less what the positions do, up")
     assert value == pytest.approx(-0.04, abs=max(3 * sigma, 0.005))
-    assert "truth.velocity: null" in {f.mend for check in checks for f in check.findings}
+    assert "truth.velocity: null" in {f.fix for check in checks for f in check.findings}
 
 
 def test_the_heading_offset_of_ictineu_is_found(tmp_path: Path, recorded_data: Path) -> None:
@@ -325,7 +325,7 @@ def test_the_heading_offset_of_ictineu_is_found(tmp_path: Path, recorded_data: P
     assert abs(turn + 4.4) < 3 * sigma
     scale, sigma = fact(checks, PATH, "scale that the DVL needs")
     assert abs(scale - 1.028) < 3 * sigma
-    assert [f.mend.split("#")[0].strip() for c in checks for f in c.findings] == ["streams.heading.add_deg: 4.4"]
+    assert [f.fix.split("#")[0].strip() for c in checks for f in c.findings] == ["streams.heading.add_deg: 4.4"]
 
 
 @pytest.mark.slow
@@ -334,7 +334,7 @@ def test_the_gyro_bias_of_ictineu_is_found_and_its_compass_is_disturbed(tmp_path
     checks = cross_checks(naive(tmp_path, recorded_data, ICTINEU, changes))
     bias, sigma = fact(checks, "gyro against heading", "gyro bias about the vertical")
     assert abs(bias + 0.0114) < max(3 * sigma, 0.0003)  # z down in its file, up in ours
-    mends = {f.mend.split(": ")[0] for check in checks for f in check.findings}
+    mends = {f.fix.split(": ")[0] for check in checks for f in check.findings}
     assert mends == {"streams.imu.noise.gyro_bias_sigma", "streams.heading.sigma_deg"}
 
 
@@ -386,10 +386,10 @@ def test_clocks_are_chained_to_the_imu_and_a_contradiction_is_seen() -> None:
         return Delay(late, than, Estimate(by, 0.01))
 
     chain = [delay("heading", "imu", 0.1), delay("dvl", "heading", 0.2), delay("gps", "truth position", 1.0)]
-    story = weigh(chain)
+    story = fit_clocks(chain)
     assert {name: round(late.value, 6) for name, late in story.late.items()} == {"heading": 0.1, "dvl": 0.3}
     assert story.agrees
-    again = weigh([*chain, delay("dvl", "imu", 0.31)])
+    again = fit_clocks([*chain, delay("dvl", "imu", 0.31)])
     assert again.agrees
     assert again.late["dvl"].sigma < story.late["dvl"].sigma
-    assert not weigh([*chain, delay("dvl", "imu", 0.9)]).agrees
+    assert not fit_clocks([*chain, delay("dvl", "imu", 0.9)]).agrees

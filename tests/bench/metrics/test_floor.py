@@ -17,7 +17,8 @@ from fathom.bench.metrics.floor_ratio import rmse_over_floor, squares
 from fathom.datasets import Belief, Log, Trajectory
 from fathom.datasets.epochs import SENSOR, cut
 from fathom.datasets.log import ImuStream
-from fathom.datasets.simulated.scenario import IMU_GRADES, Scenario
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
+from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec
 from fathom.datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY
@@ -25,9 +26,9 @@ from fathom.estimators import FACTORS, create
 from fathom.estimators.filters.eskf_filterpy import stack
 from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise
 from fathom.estimators.physics.state import STATE, as_record, with_rate_noise
+from linear import whitened
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
-from test_rts import whitened
 
 LAGS = (0.0, 1.0, 3.0, 10.0, math.inf)
 SECOND = 10**9

@@ -143,7 +143,7 @@ def test_the_terminals_table_and_the_csv_say_the_same(rows: pd.DataFrame, tmp_pa
     for _, row in table.iterrows():
         assert f"{row['ate_rmse_m']:.3g}" in text
     assert "alignment: none" in text
-    assert "against the truth" in text
+    assert "against ground truth" in text
     assert "–" in text  # dead reckoning's NEES
     assert "…" not in text
 
@@ -184,7 +184,7 @@ def test_a_log_whose_readings_lay_outside_is_named_with_their_number(rows: pd.Da
     assert printed(rows.assign(counts=counts), tmp_path).count(lost) == 1
 
 
-# -- honesty ----------------------------------------------------------------------------------------------------------
+# -- consistency -------------------------------------------------------------------------------------------------------
 
 JUDGED = ("dead-reckoning", "eskf", "overconfident", "rts")
 
@@ -208,7 +208,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path
     return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
 
 
-def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_the_consistency_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     summary = {(row["label"], row["output"]): row for row in summarise(rows)}
     honest, wrong = summary["eskf", "online"], summary["overconfident", "online"]
@@ -218,7 +218,7 @@ def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame
     assert honest["nis_gps"] is None  # it comes late
     assert summary["rts", "smoothed"]["nis_dvl"] is None
     text = printed(rows, tmp_path, 120)
-    lines = text[text.index("honesty") :].splitlines()
+    lines = text[text.index(": consistency") :].splitlines()
     of = {label: next(line for line in lines if line.startswith(label)) for label in JUDGED}
     assert f"▲{wrong['anees_velocity_above']}" in of["overconfident"]
     assert "▲" not in of["eskf"]
@@ -230,7 +230,7 @@ def test_the_honesty_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame
     assert "gps" not in lines[2]
 
 
-def test_the_widest_honesty_table_fits_120_columns(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_the_widest_consistency_table_fits_120_columns(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     labels = rows["label"].replace({label: f"{label:-<24}" for label in JUDGED})
     text = printed(
@@ -241,8 +241,8 @@ def test_the_widest_honesty_table_fits_120_columns(judged: tuple[pd.DataFrame, P
     assert "…" not in text
 
 
-def test_few_seeds_without_nis_have_no_honesty_table(rows: pd.DataFrame, tmp_path: Path) -> None:
-    assert "honesty" not in printed(rows, tmp_path)
+def test_few_seeds_without_nis_have_no_consistency_table(rows: pd.DataFrame, tmp_path: Path) -> None:
+    assert ": consistency" not in printed(rows, tmp_path)
     assert "late readings" not in printed(rows, tmp_path)
 
 
@@ -359,7 +359,7 @@ def test_a_figure_is_as_wide_as_a_column_with_no_text_cut_off_nor_too_small(
 
 def test_a_label_is_drawn_as_it_stands(drawn: dict[str, Figure]) -> None:
     shown = [text.get_text() for legend in drawn["costs"].legends for text in legend.get_texts()]
-    assert [" ".join(text.split()).replace(r"\$", "$") for text in shown] == [*ODD, "with hindsight"]
+    assert [" ".join(text.split()).replace(r"\$", "$") for text in shown] == [*ODD, "smoothed"]
     assert not any(text.get_usetex() for text in texts(drawn["costs"]))
 
 

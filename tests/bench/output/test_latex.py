@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fathom.bench.output.tables.latex import COLUMNS, latex, number, write_latex
+from fathom.bench.output.cells import ACCURACY as COLUMNS
+from fathom.bench.output.tables.latex import latex, number, write_latex
 from fathom.bench.output.tables.latex_text import ACCENTS, ESCAPED, GREEK, escape
 from fathom.bench.output.tables.table import write_table
 from fathom.bench.results.store import COLUMNS as STORED
@@ -134,11 +135,17 @@ def test_what_did_not_end_every_run_is_said_and_not_ranked() -> None:
 
 def test_the_caption_states_seeds_alignment_dimensions_and_step() -> None:
     caption = next(line for line in latex(table(align="yaw", dims="2d")).splitlines() if line.startswith(r"\caption"))
-    stated = ("6 seeds (1\\textendash{}6)", "alignment: yaw", "in 2d", "RPE over 10 m, all pairs", "against the truth")
+    stated = (
+        "6 seeds (1\\textendash{}6)",
+        "alignment: yaw",
+        "in 2d",
+        "RPE over 10 m, all pairs",
+        "against ground truth",
+    )
     for words in (*stated, "95 \\% interval", "Costs on Some Processor, 2 cores", "Bold"):
         assert words in caption, words
     few = latex(table(seeds=2))
-    assert "2 seeds (1, 2)" in few
+    assert "2 seeds (1\\textendash{}2)" in few
     assert "Intervals need 5 seeds" in few
     assert "^{+" not in few
     alone = latex(table(seeds=1).assign(seed=pd.NA))
@@ -148,7 +155,7 @@ def test_the_caption_states_seeds_alignment_dimensions_and_step() -> None:
 
 def test_costs_of_runs_with_nis_are_not_ranked() -> None:
     text = latex(table(spec='{"scores": {"nis": true}}'))
-    assert "not to be compared, for NIS was taken" in text
+    assert "Costs are not comparable: NIS was asked for" in text
     for of_block in blocks(text).values():
         assert not any(parse(cell)["bold"] for cells in of_block.values() for cell in cells[-3:])
 

@@ -19,16 +19,17 @@ import pytest
 from fathom.bench.cli import app as cli
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.output import present as presenting
+from fathom.bench.output.cells import ACCURACY, spans
 from fathom.bench.output.figures.track import load_trajectory
 from fathom.bench.output.report.page import ordinal, render
 from fathom.bench.output.report.results import differences_of, in_order, kept_plan
-from fathom.bench.output.report.runs import spans
-from fathom.bench.output.tables.table import SHOWN, print_table
+from fathom.bench.output.tables.table import print_table
 from fathom.bench.results.intervals import interval_over_seeds
 from fathom.bench.results.store import load_runs
 from rich.console import Console
 from typer.testing import CliRunner
 
+SHOWN = [column.score for column in ACCURACY]
 EXPERIMENT = """
 description: "Does hindsight pay? <b>Not bold</b> & short."
 logs: [{scenario: {duration_s: 40}}]
@@ -423,8 +424,8 @@ def test_what_a_store_lacks_is_said_and_the_rest_is_shown(
             plot.locator(".main-svg").first.wait_for()
         assert "7: 5 done, 1 failed, 1 absent" in page.locator(".facts").inner_text()
     for said in (
-        "not here: gone", "OSError: no disk", "3.2", "nothing to score against",
-        "there is nothing to compare them with",
+        "not here: gone", "OSError: no disk", "3.2", "no ground truth to score against",
+        "there is no ground truth to compare them with",
         "lost files: trajectories are missing from the figures: no such.parquet: not there, and 1 more",
         "cut off: trajectories are missing from the figures: cut.parquet: ArrowInvalid",
         "There is nothing to draw", "made with 3 machines", "not recorded", "no intervals: they need 5 seeds",

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fathom.bench.experiment.comparison import Comparison
 from fathom.bench.metrics import ScoreError, pooled_rmse
+from fathom.bench.metrics.comparison import Comparison
 from fathom.bench.output.tables.table import print_table
 from fathom.bench.results.paired import (
     FEWEST_SEEDS,
@@ -342,7 +342,7 @@ def test_the_printed_table_holds_the_differences() -> None:
         assert words in section
     assert f"{100 * (record['ratio'] - 1):+.0f}" in section
     assert "corrected by Holm for 1 tests" in " ".join(section.split())
-    assert "against" not in printed(rows, []).replace("nothing to score against", "")
+    assert "against" not in printed(rows, []).replace("no ground truth to score against", "")
 
 
 def test_the_printed_table_says_when_seeds_are_too_few_for_so_many_tests() -> None:

@@ -1,4 +1,4 @@
-"""The budgets of DESIGN, section 8: what is far from its limit must hold on any machine, however busy."""
+"""The budgets of `fathom timing budgets`: what is far from its limit must hold on any machine, however busy."""
 
 from __future__ import annotations
 

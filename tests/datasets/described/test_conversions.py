@@ -13,7 +13,7 @@ import yaml
 from fathom.datasets import DatasetError, Log
 from fathom.datasets.described import description as description_module
 from fathom.datasets.described.opening import open_log
-from fathom.datasets.formats.recording import Held, Messages, Recording, Wanted
+from fathom.datasets.formats.recording import Messages, Recording, TopicInfo, Wanted
 from fathom.datasets.log import AttitudeStream
 from scipy.spatial.transform import Rotation
 
@@ -241,16 +241,19 @@ def test_an_axis_of_infinite_sigma_stays_alone_where_the_mounting_leaves_it_its_
     ("changes", "error"),
     [
         ({"measures": ["x", "w", "z"]}, r"streams.dvl.measures\[1\]`: .*'x', 'y' or 'z'.*found 'w'"),
-        ({"measures": ["x", "x", "z"]}, r"streams.dvl`: measures: an axis stands there twice"),
+        ({"measures": ["x", "x", "z"]}, r"streams.dvl`: measures: an axis is named twice"),
         ({"measures": []}, r"streams.dvl.measures"),
         ({"measures": ["x", "y"]}, r"velocity: expected 2 columns, found 3"),
         ({"velocity": {"columns": ["a"], "unit": "m/s"}}, r"velocity: expected 3 columns, found 1"),
         ({"sigma_m_s": [0.1, 0.2]}, r"sigma_m_s: expected 3 numbers, found 2"),
         ({"sigma_m_s": [0.1, 0.2, 0.0]}, r"streams.dvl.sigma_m_s"),
-        ({"mounting": {"translation_m": [0.1, 0, 0]}}, r"mounting: B sits in the DVL; give the other sensors'"),
+        (
+            {"mounting": {"translation_m": [0.1, 0, 0]}},
+            r"mounting: the DVL is the origin of B; give the other sensors'",
+        ),
         (
             {"measures": ["x"], "velocity": {"columns": ["a"], "unit": "m/s"}, "mounting": {"yaw_deg": 5}},
-            r"mounting: only a velocity measured along all three axes can be turned",
+            r"mounting: only a velocity measured along all three axes can be rotated",
         ),
         ({"mounting": {"R_BS": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}}, r"R_BS must be a 3 × 3 rotation"),
         ({"mounting": {"R_BS": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "yaw_deg": 3}}, r"give R_BS or the angles, not both"),
@@ -368,7 +371,7 @@ def test_a_receiver_without_a_fix_is_not_at_the_centre_of_the_earth(folder):
 
 def test_an_earth_centred_place_is_one_by_itself(folder):
     part = {**ecef_part(None), "sigma_m": 1.0, "geodetic": {"latitude": "a", "longitude": "b"}}
-    with pytest.raises(DatasetError, match="ECEF positions are places by themselves: leave `geodetic` out"):
+    with pytest.raises(DatasetError, match="ECEF positions are global already: leave `geodetic` out"):
         opened(folder, {"gps": part})
 
 
@@ -387,7 +390,7 @@ class Invented(Recording):
         found = [{c: np.asarray(self.held[want.message][c]) for c in want.columns} for want in wanted]
         return Messages(found, ("invented: told",))
 
-    def contents(self, folder: Path) -> list[Held]:
+    def contents(self, folder: Path) -> list[TopicInfo]:
         return []
 
 

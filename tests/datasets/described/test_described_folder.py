@@ -15,9 +15,10 @@ from fathom.datasets.described.conversion import _stray
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.opening import RecordingNotFound, catalog_names, open_log
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from written import FUZZ, log_or_error
 
 NOISE = {
     "gyro_density": 1e-4, "accel_density": 1e-3, "gyro_walk": 1e-6, "accel_walk": 1e-5, "gyro_bias_sigma": 1e-3,
@@ -379,7 +380,7 @@ def test_a_quaternion_that_is_none_is_refused_or_repaired(folder):
 
 def test_two_columns_of_one_name_are_refused(folder):
     (folder / "depth.csv").write_text("counts, counts\n20,1\n")
-    with pytest.raises(DatasetError, match="2 columns are called 'counts'"):
+    with pytest.raises(DatasetError, match="2 columns are named 'counts'"):
         open_log(folder)
 
 
@@ -644,19 +645,6 @@ def test_errors_of_the_rig_and_the_imu_name_the_log(folder):
     with pytest.raises(DatasetError) as error:
         open_log(folder)
     assert str(error.value).startswith(f"{folder}: imu: 1 samples")
-
-
-def log_or_error(folder: Path, *, repair: bool = False) -> None:
-    try:
-        log = open_log(folder, repair=repair)
-    except DatasetError:
-        return
-    assert isinstance(log, Log)
-
-
-FUZZ = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
 
 
 @FUZZ

@@ -18,8 +18,9 @@ from fathom.datasets.formats.recording import Wanted
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import GpsSpec, ImuSpec
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from written import FUZZ
 from written_ardupilot import MESSAGES, definition, head, message, units, write_ardupilot
 
 FILE = "00000001.BIN"
@@ -148,21 +149,21 @@ def test_bytes_between_messages_are_passed_over_and_told(tmp_path):
     data = head() + imu(1) + imu(2) + b"junk\xa3\x95\x00\xa3" + imu(3) + imu(4)
     values, notes = times(tmp_path, data)
     assert values == [1, 3, 4]  # message 2 has no other behind it: it may have been cut
-    assert notes == (f"ardupilot: 1 stretches, {len(imu(2)) + 8} bytes, of no whole message passed over",)
+    assert notes == (f"ardupilot: 1 stretches, {len(imu(2)) + 8} bytes, of no whole message skipped",)
 
 
 def test_a_message_that_lost_its_tail_takes_no_bytes_of_the_next(tmp_path):
     data = head() + imu(1) + imu(2)[:-9] + imu(3) + imu(4)
     values, notes = times(tmp_path, data)
     assert values == [1, 3, 4]
-    assert notes == (f"ardupilot: 1 stretches, {len(imu(2)) - 9} bytes, of no whole message passed over",)
+    assert notes == (f"ardupilot: 1 stretches, {len(imu(2)) - 9} bytes, of no whole message skipped",)
 
 
 @pytest.mark.parametrize("cut", [1, 2, 3, 30])
 def test_a_truncated_tail_is_told(tmp_path, cut):
     values, notes = times(tmp_path, head() + imu(1) + imu(2) + imu(3)[:cut])
     assert values == [1, 2]
-    assert notes[0] == f"ardupilot: 1 stretches, {cut} bytes, of no whole message passed over"
+    assert notes[0] == f"ardupilot: 1 stretches, {cut} bytes, of no whole message skipped"
     assert ("ardupilot: the file ends inside a message" in notes) == (cut >= 3)
 
 
@@ -171,7 +172,7 @@ def test_a_format_that_contradicts_itself_spoils_only_its_own_messages(tmp_path)
     broken = definition("BARO", length=0) + definition("ATT", letters="Qcc?cCCCCB") + definition("AHR2", columns="a,a")
     data = broken + head()[89:] + imu(1) + imu(2)
     assert times(tmp_path, data)[0] == [1, 2]
-    assert "ardupilot: 3 FMT messages that contradict themselves passed over" in times(tmp_path, data)[1]
+    assert "ardupilot: 3 FMT messages that contradict themselves skipped" in times(tmp_path, data)[1]
 
 
 def test_a_kind_may_change_its_layout_on_the_way(tmp_path):
@@ -212,7 +213,7 @@ def test_what_is_not_in_the_log_is_named(tmp_path, want, error):
 
 @pytest.mark.parametrize("data", [b"", b"\xa3", b"\xa3\x95\x80" * 50, b"not a log at all " * 99, imu(1)])
 def test_what_is_no_log_is_called_so(tmp_path, data):
-    with pytest.raises(DatasetError, match=rf"{FILE}: not one whole dataflash message"):
+    with pytest.raises(DatasetError, match=rf"{FILE}: contains no whole dataflash message"):
         times(tmp_path, data)
 
 
@@ -237,6 +238,7 @@ print((after - before) * (1 if sys.platform == "darwin" else 1024), len(columns[
 """
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_what_is_wanted(tmp_path):
     """40 MB of log of which 0.1 MB is wanted: the file is neither held nor indexed."""
     other = b"".join(imu(i) for i in range(1000))
@@ -250,9 +252,6 @@ def test_memory_is_that_of_what_is_wanted(tmp_path):
     grown, rows = map(int, ran.stdout.split())
     assert rows == 7000
     assert grown < 12e6 < size / 3
-
-
-FUZZ = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
 
 
 @pytest.fixture(scope="module")

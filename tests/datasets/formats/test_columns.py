@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from fathom.datasets.described.opening import CATALOG, open_log
 from fathom.datasets.formats import columns as module
 from fathom.datasets.formats.columns import Table, read_table
 from fathom.datasets.times import times_ns
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from written import FUZZ
 
 START = 1_700_000_000
 PIECES = pytest.mark.parametrize(("rows", "size"), [(1, 1), (2, 7), (3, 100), (1000, 1 << 18)])
@@ -153,7 +155,7 @@ def test_a_parquet_file_may_be_empty_or_name_a_column_twice(tmp_path):
     read = read_table(tmp_path, Table(file="a.parquet"), ["x"], ["t"])
     assert {name: len(values) for name, values in read.items()} == {"x": 0, "t": 0}
     pq.write_table(pa.Table.from_arrays([pa.array([1]), pa.array([2])], ["x", "x"]), tmp_path / "a.parquet")
-    with pytest.raises(DatasetError, match="2 columns are called 'x'"):
+    with pytest.raises(DatasetError, match="2 columns are named 'x'"):
         read_table(tmp_path, Table(file="a.parquet"), ["x"])
 
 
@@ -161,8 +163,8 @@ MEASURE = """
 import resource, sys
 from pathlib import Path
 import numpy as np, pandas as pd
-from fathom.datasets.formats.columns import read_table, times_ns
-from fathom.datasets.described.description import Table
+from fathom.datasets.formats.columns import Table, read_table
+from fathom.datasets.times import times_ns
 folder, name = Path(sys.argv[1]), sys.argv[2]
 form = Table(file=name)
 small = read_table(folder, Table(file="small" + Path(name).suffix), ["c1", "c2"], ["t"])  # what the libraries take
@@ -174,6 +176,7 @@ print((after - before) * (1 if sys.platform == "darwin" else 1024), len(t_ns), i
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_memory_is_that_of_the_wanted_columns(tmp_path, suffix):
     """A table of 110 MB and 20 columns, of which 3 are wanted: 300,000 rows, 7 MB."""
@@ -260,7 +263,7 @@ def test_an_array_of_numbers_may_be_empty(arrays):
         (np.zeros(5, complex), r"v.npy: expected numbers in rows and columns, found"),
         (np.zeros(5, [("x", float)]), r"v.npy: expected numbers in rows and columns, found"),
         (np.array([{}] * 5, object), r"v.npy: cannot be read as an array"),
-        (np.zeros((4, 3)), r"arrays that stand side by side must be of one length, found \{'t': 5, 'v.0': 4"),
+        (np.zeros((4, 3)), r"the arrays must be of equal length, found \{'t': 5, 'v.0': 4"),
         (np.zeros((5, 2)), r"no column 'v.2'; did you mean 'v.[01]'\?; found t, v.0, v.1"),
         (np.zeros(5), r"no column 'v.0'; found t, v$"),
         (b"not an array", r"v.npy: cannot be read as an array"),
@@ -306,15 +309,14 @@ class Touch:
 
 
 @pytest.fixture(scope="module")
-def comma(recorded_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Log:
+def comma(recording: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Log:
     """As catalogued, but with every speed."""
-    if not (recorded_data / "comma2k19_example1").is_dir():
-        pytest.skip(f"no comma2k19_example1 in {recorded_data}")
+    recorded = recording("comma2k19_example1")
     described = (CATALOG / "comma2k19_example1.yaml").read_text(encoding="utf-8")
     assert "every: 8" in described
     every = tmp_path_factory.mktemp("comma") / "comma2k19_example1.yaml"
     every.write_text(described.replace("every: 8", "every: 1"), encoding="utf-8")
-    return open_log(every, recorded_data / "comma2k19_example1")
+    return open_log(every, recorded)
 
 
 def at(t_ns: Any, log_t_ns: Any, values: Any) -> Any:
@@ -375,9 +377,6 @@ def test_comma2k19s_reference_is_consistent_in_its_own_frame(comma):
 
 # -- damage
 
-FUZZ = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
 JUNK = st.one_of(st.binary(max_size=8), st.text('0123456789,;.-e\n\r\t infa"%#', max_size=12).map(str.encode))
 TEXT = b"% remark\nt ,x,y\n" + b"".join(b"%d.%03d, %d.5,-1e3,\r\n" % (START + i, i, i) for i in range(12))
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-import tracemalloc
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 import pytest
-from fathom.datasets import DatasetError, Log, Scenario, simulate
+from fathom.datasets import DatasetError
 from fathom.datasets.described.opening import open_log
 from fathom.datasets.formats.mcap_file import McapRecording
 from fathom.datasets.formats.recording import Wanted
@@ -19,19 +17,9 @@ from google.protobuf import descriptor_pb2, timestamp_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
-from written import assert_the_same, damaged, first_seconds, write_mcap
+from written import allocated, assert_the_same, damaged, log_or_error, write_mcap
 
 ENCODINGS = ["protobuf", "ros2", "ros1", "json"]
-
-
-@pytest.fixture(scope="session")
-def log() -> Log:
-    return simulate(Scenario(mission="lawnmower", duration_s=60, imu="tactical"), seed=4)
-
-
-@pytest.fixture(scope="session")
-def small(log: Log) -> Log:
-    return first_seconds(log, 2.5)
 
 
 def read(folder: Path, topic: str, *columns: str, file: str = "log.mcap") -> dict[str, Any]:
@@ -135,7 +123,7 @@ def test_a_message_left_out_is_not_a_zero(samples):
     np.testing.assert_array_equal(read(samples, "/s", "inner.v")["inner.v"], [0.5, np.nan])
     held = McapRecording(format="mcap", file="log.mcap").read(samples, [Wanted("/s", None, ("inner.n", "log_time"))])
     assert held.columns[0]["log_time"].tolist() == [1]
-    assert held.notes == ("/s: 1 damaged messages passed over, the first is message 1: it has no 'inner.n'",)
+    assert held.notes == ("/s: 1 damaged messages skipped, the first is message 1: it has no 'inner.n'",)
 
 
 @pytest.mark.parametrize(
@@ -220,13 +208,13 @@ def test_a_damaged_chunk_is_passed_over_and_counted(log, tmp_path):
     back = open_log(folder)
     assert 0 < len(log.imu.t_ns) - len(back.imu.t_ns) < 1000
     assert np.isin(back.imu.f_I, log.imu.f_I).all()
-    assert "log.mcap: 1 damaged chunks or records passed over" in back.notes
+    assert "log.mcap: 1 damaged chunks or records skipped" in back.notes
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + bytes(100), b"#ROSBAG V2.0\n"])
 def test_what_is_no_mcap_file_is_refused(tmp_path, content):
     (tmp_path / "log.mcap").write_bytes(content)
-    with pytest.raises(DatasetError, match=r"log\.mcap: not"):
+    with pytest.raises(DatasetError, match=r"log\.mcap: (not|contains no whole message)"):
         read(tmp_path, "/a", "x")
 
 
@@ -253,6 +241,7 @@ def test_contents_lists_the_topics(small, tmp_path, encoding):
         assert {"z.0", "sigma.0", "stamp" if encoding == "protobuf" else "header.stamp"} <= fields
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD])
 def test_what_is_not_wanted_costs_no_memory(tmp_path, compression):
     """160 MB of other messages around 20,000 small ones."""
@@ -267,13 +256,11 @@ def test_what_is_not_wanted_costs_no_memory(tmp_path, compression):
                 writer.add_message(b, i, other, i)
         writer.finish()
     read(tmp_path, "/a", "log_time")  # imports
-    tracemalloc.start()
-    found = read(tmp_path, "/a", "x", "log_time")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    with allocated() as peak:
+        found = read(tmp_path, "/a", "x", "log_time")
     wanted = sum(values.nbytes for values in found.values())
     assert wanted == n * 16
-    assert peak < 4 * wanted + 6_000_000  # a few chunks of the file
+    assert peak() < 4 * wanted + 6_000_000  # a few chunks of the file
 
 
 @pytest.fixture(scope="session")
@@ -290,11 +277,4 @@ def fuzzed(small, tmp_path_factory):
 def test_a_damaged_file_gives_a_log_or_an_error(fuzzed, seed, which):
     folder, data = fuzzed[which]
     (folder / "log.mcap").write_bytes(damaged(data, seed))
-    start = perf_counter()
-    try:
-        assert isinstance(open_log(folder, repair=True), Log)
-    except DatasetError:
-        pass
-    finally:
-        (folder / "log.mcap").write_bytes(data)
-    assert perf_counter() - start < 20
+    log_or_error(folder, repair=True)

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from fathom.datasets import DatasetError
 from fathom.datasets.described.opening import open_log
-from fathom.datasets.formats.recording import LOADERS, Recording, extra, known_formats, loader, not_held
+from fathom.datasets.formats.recording import LOADERS, Recording, extra, known_formats, loader, not_found
 
 NOISE = dict.fromkeys(
     ("gyro_density", "accel_density", "gyro_walk", "accel_walk", "gyro_bias_sigma", "accel_bias_sigma"), 1e-3
@@ -42,7 +42,7 @@ from typing import ClassVar
 import numpy as np
 
 from fathom.datasets import DatasetError
-from fathom.datasets.formats.recording import Held, Messages, Recording, not_held
+from fathom.datasets.formats.recording import TopicInfo, Messages, Recording, not_found
 
 FIELDS = {"Inertial": ("p", "q", "r", "fx", "fy", "fz"), "Depth": ("metres",)}
 
@@ -60,7 +60,7 @@ class LinesRecording(Recording):
         found = []
         for want in wanted:
             if want.message not in FIELDS:
-                raise not_held(str(self.path(folder)), "message", want.message, FIELDS)
+                raise not_found(str(self.path(folder)), "message", want.message, FIELDS)
             rows = [row for row in self.rows(folder) if row[0] == want.message and want.sender in (None, row[1])]
             columns = {"host": np.array([row[2] for row in rows])}
             columns |= dict(zip(FIELDS[want.message], np.array([row[3] for row in rows]).T))
@@ -68,7 +68,7 @@ class LinesRecording(Recording):
         return Messages(found, (f"lines: {len(found)} kinds read",))
 
     def contents(self, folder):
-        return [Held("Inertial", "", 10, 1.0, FIELDS["Inertial"], 2)]
+        return [TopicInfo("Inertial", "", 10, 1.0, FIELDS["Inertial"], 2)]
 '''
 
 
@@ -210,10 +210,10 @@ def test_an_extra_hides_no_other_error():
 
 def test_what_is_not_held_is_told_with_what_is_and_not_with_all_of_it():
     names = [f"/topic/{i:03d}" for i in range(100)]
-    told = str(not_held("x.bag", "topic", "/topic/0033", names))
+    told = str(not_found("x.bag", "topic", "/topic/0033", names))
     assert told.startswith("x.bag: no topic '/topic/0033'; did you mean '/topic/0")
     assert told.endswith("/topic/039, …")
-    assert str(not_held("x.bag", "topic", "/imu", [])) == "x.bag: no topic '/imu'; found none"
+    assert str(not_found("x.bag", "topic", "/imu", [])) == "x.bag: no topic '/imu'; found none"
 
 
 def test_a_recording_without_a_folder_says_so(tmp_path):

@@ -156,6 +156,7 @@ def test_disorder_lets_readings_overtake_one_another_and_moves_nothing_else():
     assert np.array_equal(mixed.dvl.received_ns, prompt.dvl.received_ns)
 
 
+@pytest.mark.slow
 def test_prior_error_has_the_covariance_it_states():
     seeds = range(200)
     errors, nees = [], []

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
+from driver import run_log
 from fathom.datasets import Belief, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import DEPTH, DVL, GPS, Epoch, cut
 from fathom.datasets.simulated.scenario import Scenario
@@ -14,6 +14,7 @@ from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DvlSpec, GpsSpec, HeadingSpec
 from fathom.estimators import Diverged, create
 from fathom.estimators.physics.elimination import decorrelate
+from logs import until
 from paths import NOISE, reading
 
 
@@ -87,17 +88,10 @@ def test_a_late_reading_is_worth_what_it_would_have_been_in_time(delay_s: float)
     )
     in_time, delayed = simulate(scenario, seed=5), simulate(late, seed=5)
     last = int(delayed.imu.t_ns[-1] - delay_s * 1e9)
-    keep = {name: _until(stream, last) for name, stream in in_time.streams.items()}
-    keep_late = {name: _until(stream, last) for name, stream in delayed.streams.items()}
-    a, b = drive(replace(in_time, **keep)), drive(replace(delayed, **keep_late))
+    a, b = drive(until(in_time, last)), drive(until(delayed, last))
     sigma = np.sqrt(np.diag(a.P))
     assert np.abs(a.state.local(b.state) / sigma).max() < 1e-3
     assert np.allclose(np.diag(b.P), np.diag(a.P), rtol=1e-3)
-
-
-def _until(stream: object, t_ns: int) -> object:
-    rows = stream.t_ns <= t_ns
-    return type(stream)(stream.t_ns[rows], stream.received_ns[rows], stream.z[rows], stream.sigma[rows])
 
 
 def test_a_reading_beyond_reach_is_counted_and_left_out() -> None:

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
-from fathom.bench.execution.result import Result
-from fathom.bench.metrics import associate, state_errors
-from fathom.bench.metrics.pose_error import heading_roll_pitch, wrapped
-from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig
-from fathom.datasets.epochs import DEPTH, DVL, GPS, IMU_SAMPLE, Epoch
+from driver import FILTERS, heading_error_rad, matched, run_log
+from fathom.datasets import Belief, Log, NavState
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import DvlSpec, GpsSpec
 from fathom.estimators import create
 from fathom.estimators.filters.iekf import (
     from_invariant,
@@ -27,11 +20,11 @@ from fathom.estimators.interface import FACTORS
 from fathom.estimators.physics.imu import BLOCK, integrate, predict
 from fathom.estimators.physics.imu import compile_rig as compiled
 from fathom.estimators.physics.state import STATE, as_belief, as_record
-from paths import GRAVITY, Path, random_rig, random_state, reading
+from linear import LINEAR, TOY_RIG, linear_toy
+from logs import DELAYED, until
+from paths import GRAVITY, Path, random_rig, random_state
 from scipy.spatial.transform import Rotation
 
-FILTERS = ["eskf", "eskf-filterpy", "iekf", "ukf", "rts"]
-"""By their online beliefs; rts gives eskf's until it finishes."""
 DEGREE = np.pi / 180
 
 
@@ -41,14 +34,7 @@ def difference(a: Belief, b: Belief) -> tuple[float, float]:
     return np.abs(a.state.local(b.state)).max(), np.abs((a.P - b.P) / np.outer(sigma, sigma)).max()
 
 
-def beliefs(result: Result) -> list[Belief]:
-    track = result.online
-    return [Belief(int(t), track.state(k), track.P[k]) for k, t in enumerate(track.t_ns)]
-
-
 # -- one filter, written twice ----------------------------------------------------------------------------------------
-
-DELAYED = {"dvl": DvlSpec(delay_s=0.31), "gps": GpsSpec(delay_s=0.83)}
 
 
 @pytest.mark.parametrize(
@@ -64,44 +50,12 @@ def test_filterpys_filter_is_ours_over_a_whole_mission(scenario: Scenario) -> No
     log = simulate(scenario, seed=4)
     ours, theirs = run_log(log, create("eskf")), run_log(log, create("eskf-filterpy"))
     assert theirs.counts == ours.counts
-    assert len(beliefs(ours)) == 120
-    worst = np.array([difference(a, b) for a, b in zip(beliefs(ours), beliefs(theirs), strict=True)])
+    assert len(ours.beliefs) == 120
+    worst = np.array([difference(a, b) for a, b in zip(ours.beliefs, theirs.beliefs, strict=True)])
     assert worst.max() < 1e-6
 
 
 # -- a linear toy -----------------------------------------------------------------------------------------------------
-
-TINY = 1e-12
-TOY_RIG = Rig(ImuNoise(TINY, 2e-3, TINY, 1e-4, TINY, 0.02), gravity=GRAVITY)
-LINEAR = np.r_[3:12]
-"""Position, velocity and accelerometer bias: all that is uncertain in the toy."""
-
-
-def linear_toy(seed: int, epochs: int = 40, rig: Rig = TOY_RIG) -> tuple[Belief, list[Epoch]]:
-    """A vehicle that never turns and knows its attitude: then every sensor is linear in what it does not know."""
-    rng, noise = np.random.default_rng(seed), rig.imu_noise
-    R_WB, n, dt_s = Rotation.random(rng=rng).as_matrix(), 20, 0.01
-    p, v, b_a = rng.normal(size=3), rng.normal(size=3), rng.normal(size=3) * noise.accel_bias_sigma
-    sigma = np.repeat([TINY, 1.0, 0.2, noise.accel_bias_sigma, TINY], 3)
-    draw = sigma * rng.normal(size=15)
-    prior = Belief(0, NavState(R_WB, p, v, b_a, np.zeros(3)).retract(np.r_[np.zeros(3), draw[3:12], np.zeros(3)]), None)
-    cut, up, R_IW = [], np.array([0.0, 0.0, GRAVITY]), (R_WB @ rig.imu.R_BS).T
-    for k in range(epochs):
-        imu = np.zeros(n, IMU_SAMPLE)
-        imu["t_ns"] = np.round((np.arange(1, n + 1) + n * k) * dt_s * 1e9)
-        imu["dt_s"] = imu["period_s"] = dt_s
-        a_W = 0.3 * rng.normal(size=3)
-        imu["f_I"] = R_IW @ (a_W + up) + b_a + noise.accel_density / np.sqrt(dt_s) * rng.normal(size=(n, 3))
-        T = n * dt_s
-        p, v = p + v * T + 0.5 * a_W * T**2, v + a_W * T
-        t_ns = int(imu["t_ns"][-1])
-        rows = [reading(DVL, R_WB.T @ v + 0.01 * rng.normal(size=3), np.full(3, 0.01), t_ns)]
-        if k % 2:
-            rows.append(reading(DEPTH, p[2:] + 0.02 * rng.normal(), np.array([0.02]), t_ns))
-        if k % 5 == 0:
-            rows.append(reading(GPS, p + rng.normal(size=3), np.array([1.0, 1.0, np.inf]), t_ns))
-        cut.append(Epoch(t_ns, imu, np.concatenate(rows), True))
-    return replace(prior, P=np.diag(sigma**2)), cut
 
 
 @pytest.mark.parametrize("name", [name for name in FILTERS if name != "eskf"])
@@ -218,9 +172,9 @@ def test_invariant_filter_finds_a_heading_that_is_60_degrees_off(known: str) -> 
     for seed in range(12):
         log = with_unknown_heading(simulate(AFLOAT, seed), seed, known)
         for name, errors in error_deg.items():
-            truth, online = associate(log.truth, run_log(log, create(name)).online)
-            heading = wrapped(heading_roll_pitch(online.R_WB) - heading_roll_pitch(truth.R_WB))[:, 0]
-            errors.append(abs(heading[truth.t_ns == log.start_ns + 60 * 10**9][0]) / DEGREE)
+            online = run_log(log, create(name)).online
+            heading = heading_error_rad(log.truth, online)
+            errors.append(abs(heading[online.t_ns == log.start_ns + 60 * 10**9][0]) / DEGREE)
     assert max(error_deg["iekf"]) < 10
     assert max(error_deg["iekf"]) < 0.5 * min(error_deg["eskf"])
 
@@ -235,9 +189,9 @@ def test_filters_that_are_well_set_up_are_equally_good() -> None:
     for seed in range(10):
         log = simulate(Scenario(mission="yo-yo", duration_s=120.0), seed)
         for name, squares in pooled.items():
-            truth, online = associate(log.truth, run_log(log, create(name)).online)
-            e = state_errors(truth, online)
-            squares += [((online.p_WB_W - truth.p_WB_W) ** 2).mean(), e.velocity_m_s**2]
+            online = run_log(log, create(name)).online
+            truth = matched(log.truth, online)
+            squares += [np.square(getattr(online, x) - getattr(truth, x)).mean() for x in ("p_WB_W", "v_WB_W")]
     for name in ("iekf", "ukf"):
         assert np.sqrt(pooled[name] / pooled["eskf"]) == pytest.approx(1.0, abs=0.05)
 
@@ -245,7 +199,7 @@ def test_filters_that_are_well_set_up_are_equally_good() -> None:
 @pytest.mark.parametrize("alpha", [0.1, 1.0])
 def test_where_sigma_points_lie_hardly_matters_from_a_good_start(alpha: float) -> None:
     log = simulate(Scenario(duration_s=60.0), seed=2)
-    a, b = (beliefs(run_log(log, create("ukf", **options)))[-1] for options in ({}, {"alpha": alpha}))
+    a, b = (run_log(log, create("ukf", **options)).beliefs[-1] for options in ({}, {"alpha": alpha}))
     sigma = np.sqrt(np.diag(a.P))
     assert np.abs(a.state.local(b.state) / sigma).max() < 0.05
     assert np.diag(b.P) == pytest.approx(np.diag(a.P), rel=0.02)
@@ -255,8 +209,8 @@ def test_where_sigma_points_lie_hardly_matters_from_a_good_start(alpha: float) -
 @pytest.mark.parametrize("psi", [-180.0, 180.0])
 def test_a_heading_across_the_wrap_is_no_full_turn(name: str, psi: float) -> None:
     log = simulate(Scenario(duration_s=30.0, course_deg=psi), seed=3)
-    truth, online = associate(log.truth, run_log(log, create(name)).online)
-    assert state_errors(truth, online).heading_deg < 1.0
+    heading = heading_error_rad(log.truth, run_log(log, create(name)).online)
+    assert np.sqrt(np.mean(heading**2)) < DEGREE
 
 
 # -- late readings ----------------------------------------------------------------------------------------------------
@@ -268,16 +222,8 @@ def test_late_readings_are_lived_through_again(name: str) -> None:
     in_time = simulate(Scenario(duration_s=30.0), seed=5)
     delayed = simulate(Scenario(duration_s=30.0, **DELAYED), seed=5)
     last_ns = int(delayed.imu.t_ns[-1] - 1e9)
-    a, b = (
-        run_log(replace(log, **{key: _until(stream, last_ns) for key, stream in log.streams.items()}), create(name))
-        for log in (in_time, delayed)
-    )
+    a, b = (run_log(until(log, last_ns), create(name)) for log in (in_time, delayed))
     assert b.counts["replayed"] > 100
     assert b.counts["late"] == 0
-    state, P = difference(beliefs(a)[-1], beliefs(b)[-1])
+    state, P = difference(a.beliefs[-1], b.beliefs[-1])
     assert (state, P) == pytest.approx((0, 0), abs=1e-3)
-
-
-def _until(stream: object, t_ns: int) -> object:
-    rows = stream.t_ns <= t_ns
-    return type(stream)(stream.t_ns[rows], stream.received_ns[rows], stream.z[rows], stream.sigma[rows])

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import scipy.linalg
-from fathom.bench.execution.drive import run_log
-from fathom.bench.metrics import associate, state_errors
+from driver import matched, run_log
 from fathom.datasets import Belief, Trajectory
 from fathom.datasets.epochs import Epoch, cut
 from fathom.datasets.simulated.scenario import Scenario
@@ -16,14 +12,12 @@ from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec
 from fathom.estimators import create
 from fathom.estimators.filters import rts
-from fathom.estimators.filters.eskf_filterpy import stack
 from fathom.estimators.filters.rts import PAGE, STANDSTILL, smooth_one
-from fathom.estimators.interface import FACTORS
 from fathom.estimators.physics.elimination import divide_into
-from fathom.estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise
-from fathom.estimators.physics.state import STATE, as_belief, as_record, with_rate_noise
+from fathom.estimators.physics.state import STATE, as_belief, as_record
+from linear import LINEAR, TOY_RIG, least_squares, linear_toy
+from logs import DELAYED, until
 from paths import random_state
-from test_filters import DELAYED, LINEAR, TOY_RIG, linear_toy
 
 
 def smoothed(prior: Belief, epochs: list[Epoch], rig: object) -> Trajectory:
@@ -31,66 +25,6 @@ def smoothed(prior: Belief, epochs: list[Epoch], rig: object) -> Trajectory:
     for epoch in epochs:
         run.step(epoch)
     return run.finish()
-
-
-def least_squares(
-    prior: Belief, epochs: list[Epoch], rig: object, rows: np.ndarray, iterations: int
-) -> tuple[list[Belief], np.ndarray]:
-    """MAP states at the prior and after each epoch, by Gauss–Newton on the whole log as one dense problem.
-
-    Of the error state only `rows` are free. Each iteration linearises at the states themselves; motions are integrated
-    at each state's own biases. Returns the beliefs of the epochs and the last step over sigma.
-    """
-    record = compile_rig(rig, FACTORS, {})
-    first = first_sample(epochs[0].imu, record)
-    states = [prior.state]
-    before, block, F, Q = first, np.zeros(1, BLOCK), np.empty((15, 15)), np.empty((15, 15))
-    for epoch in epochs:  # start from the prior, carried on
-        x = as_record(Belief(0, states[-1], np.eye(15)))
-        integrate(epoch.imu, before, x["b_a"][0], x["b_g"][0], record, block)
-        predict(block, x, rig.gravity, F, x)
-        states.append(as_belief(0, x).state)
-        before = epoch.imu[-1:]
-    n, m = len(states), len(rows)
-    for _ in range(iterations):
-        before, grid = first, np.ix_(rows, rows)
-        lines = [whitened(n, {0: np.eye(m)}, prior.state.local(states[0])[rows], prior.P[grid])]
-        for k, epoch in enumerate(epochs):
-            x = as_record(Belief(0, states[k], np.eye(15)))
-            R_i = x["R_WB"][0].copy()
-            integrate(epoch.imu, before, x["b_a"][0], x["b_g"][0], record, block)
-            predict(block, x, rig.gravity, F, x)
-            process_noise(block, R_i, Q)
-            r = as_belief(0, x).state.local(states[k + 1])
-            lines.append(whitened(n, {k: -F[grid], k + 1: np.eye(m)}, r[rows], Q[grid]))
-            z, H, C = stack(as_record(Belief(0, states[k + 1], np.eye(15))), record, epoch.readings)
-            if len(z):
-                lines.append(whitened(n, {k + 1: H[:, rows]}, z, C))
-            before = epoch.imu[-1:]
-        A = np.concatenate(lines)
-        size = np.r_[np.linalg.norm(A[:, :-1], axis=0), 1.0]
-        upper, size = np.linalg.qr(A / size, mode="r"), size[:-1]
-        root = scipy.linalg.solve_triangular(upper[: n * m, : n * m], np.eye(n * m)) / size[:, None]
-        step = root @ upper[: n * m, -1]
-        full = np.zeros((n, 15))
-        full[:, rows] = step.reshape(n, m)
-        states = [x.retract(error) for x, error in zip(states, full, strict=True)]
-    beliefs = []
-    for k, epoch in enumerate(epochs, 1):
-        P, part = np.zeros((15, 15)), root[k * m : (k + 1) * m]
-        P[grid] = part @ part.T
-        beliefs.append(with_rate_noise(Belief(epoch.t_ns, states[k], P), record))
-    return beliefs, step / np.sqrt((root**2).sum(axis=1))
-
-
-def whitened(n: int, parts: dict[int, np.ndarray], r: np.ndarray, C: np.ndarray) -> np.ndarray:
-    """Rows [A | −r] over n states, the parts standing at theirs, whitened by C."""
-    scale, m = 1 / np.sqrt(np.diag(C)), next(iter(parts.values())).shape[1]
-    line = np.zeros((len(r), n * m + 1))
-    for k, A in parts.items():
-        line[:, k * m : (k + 1) * m] = A
-    line[:, -1] = -r
-    return np.linalg.solve(np.linalg.cholesky(C * np.outer(scale, scale)), scale[:, None] * line)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -144,14 +78,7 @@ def test_late_readings_leave_no_trace_in_hindsight(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(rts, "PAGE", 7)
     logs = simulate(Scenario(duration_s=30.0), seed=5), simulate(Scenario(duration_s=30.0, **DELAYED), seed=5)
     last_ns = int(logs[1].imu.t_ns[-1] - 1e9)
-    tracks = []
-    for log in logs:
-        streams = {}
-        for key, s in log.streams.items():
-            rows = s.t_ns <= last_ns
-            streams[key] = type(s)(s.t_ns[rows], s.received_ns[rows], s.z[rows], s.sigma[rows])
-        tracks.append(run_log(replace(log, **streams), create("rts")).smoothed)
-    a, b = tracks
+    a, b = (run_log(until(log, last_ns), create("rts")).smoothed for log in logs)
     assert np.array_equal(a.t_ns, b.t_ns)
     for k in range(len(a)):
         sigma = np.sqrt(np.diag(a.P[k]))
@@ -167,9 +94,9 @@ def test_hindsight_beats_the_filter(mission: str) -> None:
         log = simulate(Scenario(mission=mission, duration_s=120.0), seed)
         result = run_log(log, create("rts"))
         for output, total in squares.items():
-            truth, track = associate(log.truth, getattr(result, output))
-            e = state_errors(truth, track)
-            total += [((track.p_WB_W - truth.p_WB_W) ** 2).sum(axis=1).mean(), e.velocity_m_s**2]
+            track = getattr(result, output)
+            truth = matched(log.truth, track)
+            total += [np.square(getattr(track, x) - getattr(truth, x)).sum(axis=1).mean() for x in ("p_WB_W", "v_WB_W")]
     position, velocity = np.sqrt(squares["smoothed"] / squares["online"])
     assert position < 0.95
     assert velocity < 0.7

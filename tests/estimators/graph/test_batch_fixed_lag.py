@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
+from driver import run_log
 from fathom.datasets import Trajectory
 from fathom.datasets.epochs import cut
 from fathom.datasets.simulated.scenario import Scenario
@@ -45,6 +45,7 @@ def test_batch_and_incremental_lags_agree_in_state_and_in_covariance() -> None:
         assert np.abs(ratio[1:] - 1).max() < 0.02
 
 
+@pytest.mark.slow
 def test_the_batch_lag_uses_late_readings_inside_its_window_and_counts_older_ones() -> None:
     scenario = replace(TACTICAL, duration_s=30.0, gps=GpsSpec(delay_s=1.0), heading=HeadingSpec(delay_s=1.0))
     log = simulate(scenario, seed=3)
@@ -57,6 +58,7 @@ def test_the_batch_lag_uses_late_readings_inside_its_window_and_counts_older_one
     assert gaps_in_sigma(incremental.online, inside.online)[1:].max() < 0.05
 
 
+@pytest.mark.slow
 def test_with_nothing_marginalised_batch_and_incremental_lags_are_one_also_preintegrated() -> None:
     """At 3 s they are 0.2 sigma apart: iSAM2 marginalises after one step of its own, the batch one at its optimum."""
     log = simulate(replace(TACTICAL, duration_s=30.0), seed=2)
@@ -96,7 +98,7 @@ def test_a_lag_of_nothing_takes_odd_rates_and_counts_what_is_late(name: str) -> 
 
 @pytest.mark.parametrize("name", ON_GTSAM)
 def test_what_any_solver_throws_ends_the_run_as_diverged_with_cause_time_and_variable(name: str) -> None:
-    """Cholesky on the IMU noise of a tactical grade; should it learn to, tell DESIGN."""
+    """Cholesky on the IMU noise of a tactical grade; a wheel on which this fails has learnt to."""
     log = simulate(replace(TACTICAL, duration_s=20.0), seed=1)
     result = run_log(log, create(name, factorization="CHOLESKY"))
     assert result.status == "diverged"

@@ -7,13 +7,13 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
-from fathom.bench.metrics import ate, nees
+from driver import BLOCKS, error_states, nees, rmse_m, run_log
 from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, Epoch, cut
-from fathom.datasets.log import DvlStream, ImuStream, ReadingStream
+from fathom.datasets.log import DvlStream, ImuStream
 from fathom.datasets.mounting import MountingSpec
-from fathom.datasets.simulated.scenario import IMU_GRADES, Scenario
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
+from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, ImuSpec
 from fathom.estimators import FACTORS, Diverged, Pass, create
@@ -29,7 +29,8 @@ from fathom.estimators.physics.dvl_preintegration import preintegrate_dvl
 from fathom.estimators.physics.imu import BLOCK, compile_rig, integrate
 from fathom.estimators.physics.state import as_record
 from gtsam.symbol_shorthand import B, V, X
-from paths import Path, random_rig, random_rotation, random_state, reading
+from logs import until
+from paths import Path, random_rig, random_rotation, random_state, reading, residual
 from scipy.stats import chi2
 
 TACTICAL = Scenario(duration_s=120.0, imu="tactical")
@@ -56,6 +57,7 @@ def test_filter_and_smoother_agree_online(mission: str) -> None:
     assert np.abs(ratio[60:] - 1).max() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [3.0, 10.0])
 def test_hindsight_beats_the_moment(lag_s: float) -> None:
     """Pooled over seeds: a smoother that loses to its own filter has a bug. Velocity shows it best; position drifts."""
@@ -88,6 +90,7 @@ def test_one_second_keyframes_lose_nothing() -> None:
     assert position_gap_in_sigma(every.online, sparse.online, 20.0).max() < 0.3
 
 
+@pytest.mark.slow
 def test_preintegrated_dvl_navigates_about_as_well_as_velocity() -> None:
     log = simulate(replace(TACTICAL, duration_s=60.0), seed=2)
     results = {
@@ -99,7 +102,7 @@ def test_preintegrated_dvl_navigates_about_as_well_as_velocity() -> None:
         "tight straight": run_log(log, create("fls", dvl=["preintegrated-tight"], dvl_between="straight")),
         "tight both": run_log(log, create("fls", dvl=["preintegrated-tight", "velocity"])),
     }
-    rmse = {name: ate(log.truth, result.online).rmse_m for name, result in results.items()}
+    rmse = {name: rmse_m(log.truth, result.online) for name, result in results.items()}
     for name, result in results.items():
         assert result.status == "done", (name, result.cause)
         assert rmse[name] < 1.3 * rmse["velocity"] + 0.05, rmse
@@ -166,18 +169,14 @@ def test_late_readings_inside_the_window_are_used_and_older_ones_counted() -> No
     assert beyond.counts["late"] > 0.9 * sum(len(s) - 30 for s in (late.gps, late.heading))
 
 
+@pytest.mark.slow
 def test_a_late_reading_is_worth_the_same_in_hindsight() -> None:
     scenario = replace(TACTICAL, duration_s=60.0)
     in_time, late = simulate(scenario, seed=3), simulate(_late(scenario, 1.0), seed=3)
-    heard = {name: _until(getattr(in_time, name), int(late.imu.t_ns[-1]) - 10**9) for name in ("gps", "heading")}
-    a, b = (run_log(log, create("fls", lag_s=100.0)) for log in (replace(in_time, **heard), late))
+    heard = until(in_time, int(late.imu.t_ns[-1]) - 10**9, "gps", "heading")
+    a, b = (run_log(log, create("fls", lag_s=100.0)) for log in (heard, late))
     assert b.counts["late_used"] > 300
     assert np.linalg.norm(a.smoothed.p_WB_W - b.smoothed.p_WB_W, axis=1).max() < 5e-3
-
-
-def _until(stream: ReadingStream, t_ns: int) -> ReadingStream:
-    rows = stream.t_ns <= t_ns
-    return type(stream)(stream.t_ns[rows], stream.received_ns[rows], stream.z[rows], stream.sigma[rows])
 
 
 def test_a_late_dvl_makes_keyframes_where_it_was_true() -> None:
@@ -186,7 +185,7 @@ def test_a_late_dvl_makes_keyframes_where_it_was_true() -> None:
     late, in_time = run_log(log, create("fls")), run_log(simulate(scenario, seed=3), create("fls"))
     assert late.status == "done"
     assert late.counts["keyframes"] > 0.9 * in_time.counts["keyframes"]
-    assert ate(log.truth, late.online).rmse_m < 1.5 * ate(log.truth, in_time.online).rmse_m + 0.05
+    assert rmse_m(log.truth, late.online) < 1.5 * rmse_m(log.truth, in_time.online) + 0.05
 
 
 def test_a_silent_dvl_leaves_keyframes_to_the_others() -> None:
@@ -202,12 +201,13 @@ def test_what_no_sensor_tells_of_stays_unknown_when_a_keyframe_has_turned() -> N
     Seen in axes off by as much, the metre that nobody knows of east and north would look like one of height.
     """
     log = simulate(Scenario(duration_s=20.0, dvl=DvlSpec(delay_s=0.31), gps=None), seed=4)
-    eskf, fls = (run_log(log, create(name), score_period_s=0.1).online for name in ("eskf", "fls"))
+    eskf, fls = (run_log(log, create(name), period_s=0.1).online for name in ("eskf", "fls"))
     sigma = [np.sqrt(track.P.diagonal(axis1=1, axis2=2)[:, 3:6]) for track in (eskf, fls)]
     assert np.abs(sigma[1] / sigma[0] - 1).max() < 0.01
     assert np.abs(fls.p_WB_W - eskf.p_WB_W).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_long_window_finds_the_optimum_of_its_whole_graph() -> None:
     """Everything the smoother was ever given, solved by Levenberg–Marquardt: the same positions to 1 mm."""
     log = simulate(Scenario(duration_s=20.0, imu="tactical"), seed=6)
@@ -304,8 +304,6 @@ def test_factor_jacobians_are_gtsams_numerical_derivatives(what: str, seed: int)
 
 def test_native_factors_have_our_residuals() -> None:
     """Depth, GPS and attitude are GTSAM's own: the same error as the filter's, at random mountings."""
-    from test_measurements import residual
-
     rng = np.random.default_rng(5)
     rig = random_rig(rng)
     state, values = random_state(rng), gtsam.Values()
@@ -343,6 +341,7 @@ def test_diverged_is_raised_when_numbers_are_lost() -> None:
 # --- what must not matter ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_odd_rates_and_delays_leave_filter_and_smoother_in_agreement() -> None:
     """Nothing falls on a keyframe or a tick, and readings come late: a tenth of a sigma all the same."""
     scenario = replace(
@@ -409,7 +408,7 @@ def test_dvl_readings_out_of_order_are_summed_in_order() -> None:
     swapped = replace(log, dvl=replace(log.dvl, received_ns=received))
     a, b = (run_log(x, create("fls", dvl=["preintegrated-loose"])) for x in (log, swapped))
     assert b.status == "done"
-    assert ate(log.truth, b.online).rmse_m < ate(log.truth, a.online).rmse_m + 0.05
+    assert rmse_m(log.truth, b.online) < rmse_m(log.truth, a.online) + 0.05
 
 
 @pytest.mark.slow
@@ -420,7 +419,7 @@ def test_preintegration_straight_is_honest_and_held_is_known_not_to_be(mode: str
     for seed in range(n):
         log = simulate(Scenario(mission="yo-yo", duration_s=60.0, imu="tactical"), seed=seed)
         result = run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between=mode))
-        total += float(nees(log.truth, result.online, "velocity")[49])
+        total += float(nees(error_states(log.truth, result.online), result.online.P, BLOCKS["velocity"])[49])
     low, high = chi2.interval(0.999, 3 * n)
     assert (low < total < high) == honest, total / n
 

@@ -8,9 +8,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
-from fathom.bench.execution.result import Result
-from fathom.bench.metrics import ate
+from driver import Driven, rmse_m, run_log
 from fathom.datasets import Belief, Log, Trajectory
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
 from fathom.datasets.simulated.scenario import Scenario
@@ -109,11 +107,12 @@ def _gap_squared(a: Trajectory, b: Trajectory, after: int) -> np.ndarray:
 
 
 @cache
-def _plain() -> tuple[Log, Result]:
+def _plain() -> tuple[Log, Driven]:
     log = simulate(SURFACE, seed=4)
     return log, run_log(log, create("fls"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_with_honest_noise_a_loss_changes_little_and_counts_what_theory_says(loss: Loss) -> None:
     """The plain estimate is efficient, so the robust one's variance is the plain one's plus that of their difference
@@ -139,25 +138,27 @@ def _spoilt(log: Log) -> tuple[Log, int]:
     return replace(log, gps=replace(log.gps, z=z)), int(np.count_nonzero(log.gps.received_ns[bad] <= log.imu.t_ns[-1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
 def test_one_gps_reading_in_ten_fifty_metres_off_ruins_the_plain_smoother_only(loss: Loss) -> None:
     log, plain = _plain()
     spoilt, n = _spoilt(log)
     assert n >= 10
     ruined, robust = run_log(spoilt, create("fls")), run_log(spoilt, create("fls", robust={"gps": loss}))
-    good_m = ate(log.truth, plain.smoothed).rmse_m
-    assert ate(log.truth, ruined.smoothed).rmse_m > good_m + 3.0
-    assert ate(log.truth, robust.smoothed).rmse_m < good_m + (1.0 if loss == "huber" else 0.3)
+    good_m = rmse_m(log.truth, plain.smoothed)
+    assert rmse_m(log.truth, ruined.smoothed) > good_m + 3.0
+    assert rmse_m(log.truth, robust.smoothed) < good_m + (1.0 if loss == "huber" else 0.3)
     low, high = binom.interval(0.999, len(log.gps) - n, 2 * norm.sf(WIDTHS[loss]))
     assert low <= robust.counts["outliers_gps"] - n <= high
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fls-batch", "isam2", "batch"])
 def test_every_smoother_on_gtsam_takes_a_loss(name: str) -> None:
     log, plain = _plain()
     spoilt, n = _spoilt(log)
     result = run_log(spoilt, create(name, robust={"gps": "tukey"}))
-    assert ate(log.truth, result.online).rmse_m < ate(log.truth, plain.online).rmse_m + 0.3
+    assert rmse_m(log.truth, result.online) < rmse_m(log.truth, plain.online) + 0.3
     assert result.counts["outliers_gps"] == n
 
 
@@ -166,7 +167,7 @@ def test_an_outlier_between_keyframes_does_not_move_the_belief_either() -> None:
     log, _ = _plain()
     spoilt, _ = _spoilt(log)
     smoother = create("fls", keyframe_period_s=2.0, robust={"gps": "tukey"})
-    clean, robust = (run_log(x, smoother, score_period_s=0.2).online for x in (log, spoilt))
+    clean, robust = (run_log(x, smoother, period_s=0.2).online for x in (log, spoilt))
     assert np.abs(clean.p_WB_W - robust.p_WB_W).max() < 1.0
 
 
@@ -177,9 +178,10 @@ def test_a_gps_without_height_works_under_a_loss(loss: Loss) -> None:
     sigma[:, 2] = np.inf
     result = run_log(replace(log, gps=replace(log.gps, sigma=sigma)), create("fls", robust={"gps": loss}))
     assert result.status == "done", result.cause
-    assert ate(log.truth, result.online).rmse_m < ate(log.truth, plain.online).rmse_m + 0.3
+    assert rmse_m(log.truth, result.online) < rmse_m(log.truth, plain.online) + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [0.0, 0.5, 3.0])
 def test_preintegrated_dvl_takes_the_dvls_loss(lag_s: float) -> None:
     """Once the biases are known, one velocity in forty is 5 m/s off, so one displacement in eight is 1 m off."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse
-from fathom.bench.execution.drive import run_log, score_ticks
+from driver import run_log, ticks
 from fathom.datasets import Belief, Log, NavState, Trajectory
 from fathom.datasets.epochs import Epoch, cut
 from fathom.datasets.simulated.scenario import Scenario
@@ -30,7 +30,7 @@ class WholeLog:
 
     def __init__(self, log: Log) -> None:
         self.prior, self.gravity = log.prior, log.rig.gravity
-        self.epochs: list[Epoch] = cut(log, score_ticks(log, 1.0)).epochs
+        self.epochs: list[Epoch] = cut(log, ticks(log, 1.0)).epochs
         assert all((epoch.readings["t_ns"] == epoch.t_ns).all() for epoch in self.epochs)
         self.rig = compile_rig(log.rig, FACTORS, {})
         first = first_sample(self.epochs[0].imu, self.rig)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from fathom.bench.execution.drive import run_log
+from driver import run_log
 from fathom.datasets import Trajectory
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
@@ -32,6 +32,7 @@ def test_batch_and_rts_agree_in_state_and_in_covariance(mission: str) -> None:
     assert np.abs(ratio - 1).max() < 0.03  # GTSAM does not know that gyro noise moves B about a displaced IMU
 
 
+@pytest.mark.slow
 def test_isam2_ends_near_the_optimum_and_batch_does_not_depend_on_its_thresholds() -> None:
     log = simulate(Scenario(duration_s=60.0, imu="tactical"), seed=5)
     isam2, batch = (run_log(log, create(name)).smoothed for name in ("isam2", "batch"))
@@ -62,6 +63,7 @@ def test_each_option_of_exactness_brings_isam2_nearer_to_the_optimum() -> None:
     assert gap_m(stale, batch) > 100 * gaps[0]
 
 
+@pytest.mark.slow
 def test_hindsight_over_the_whole_log_beats_a_lag_which_beats_none() -> None:
     """Velocity, pooled over seeds."""
     squared = {"eskf": 0.0, "fls": 0.0, "batch": 0.0}

@@ -86,6 +86,7 @@ def test_interval_ends_on_the_keyframe_not_on_the_last_reading() -> None:
     assert straight[0] == pytest.approx(0.130 * 1.0 + 0.341 * 1.5 + 0.529 * 2.0, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("straight", [False, True])
 @pytest.mark.parametrize(("gyro_density", "sigma"), [(0.0, 0.02), (0.005, 2e-4), (0.01, 0.02)])
 def test_covariance_is_what_monte_carlo_finds(gyro_density: float, sigma: float, straight: bool) -> None:
@@ -177,6 +178,7 @@ def unlike_identity(samples: np.ndarray) -> float:
     return len(samples) * (np.trace(S) - np.linalg.slogdet(S)[1] - len(S))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("straight", [False, True])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_joint_covariance_is_what_monte_carlo_finds_and_tight_is_independent_of_the_rotation(

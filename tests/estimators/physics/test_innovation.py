@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from driver import FILTERS
 from fathom.datasets import Belief, Rig
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
 from fathom.datasets.state import VELOCITY, NavState
@@ -15,9 +16,9 @@ from fathom.estimators.interface import FACTORS
 from fathom.estimators.physics.imu import compile_rig
 from fathom.estimators.physics.innovation import innovations
 from fathom.estimators.physics.state import as_record, with_rate_noise
+from linear import TOY_RIG, linear_toy
 from paths import NOISE, random_rig, random_rotation, random_state, reading
 from scipy.stats import chi2
-from test_filters import FILTERS, TOY_RIG, linear_toy
 
 SENSORS = ("dvl", "depth", "gps", "heading", "heading")
 

@@ -13,19 +13,10 @@ from fathom.estimators import FACTORS
 from fathom.estimators.physics.imu import compile_rig
 from fathom.estimators.physics.measurements import measure, preintegrated_dvl_residual
 from fathom.estimators.physics.state import as_record
-from paths import NOISE, Path, random_rig, random_rotation, random_state, reading
+from paths import NOISE, Path, random_rig, random_rotation, random_state, reading, residual
 from scipy.spatial.transform import Rotation
 
 KINDS = {"dvl": DVL, "depth": DEPTH, "gps": GPS, "heading": HEADING, "attitude": ATTITUDE}
-
-
-def residual(
-    row: np.ndarray, state: NavState, rig: Rig, inflate: dict[str, float] | None = None
-) -> tuple[np.ndarray, ...]:
-    r, H, C = np.zeros(3), np.zeros((3, 15)), np.zeros((3, 3))
-    record = as_record(Belief(0, state, np.zeros((15, 15))))
-    n = measure(row, 0, record, compile_rig(rig, FACTORS, inflate or {}), r, H, C)
-    return r[:n].copy(), H[:n].copy(), C[:n, :n].copy()
 
 
 def numeric_jacobian(f: Callable[[NavState], np.ndarray], x: NavState, step: float = 1e-6) -> np.ndarray:

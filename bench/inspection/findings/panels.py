@@ -1,4 +1,4 @@
-"""How panels of the page look: a colour per stream, and no more points than a page can show."""
+"""How panels of the page look: one colour per stream, and no more points than a page can show."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from ...output.figures.drawing import PALETTE
 COLOURS: dict[str, str] = dict(zip(("imu", "dvl", "depth", "gps", "heading"), PALETTE, strict=False))
 AXIS_COLOURS = PALETTE[:3]
 MOST_BINS = 1000
+"""Points per curve, twice: a panel is some 500 pixels wide, so more would not be seen."""
 
 
 def colour_of(stream: str) -> str:

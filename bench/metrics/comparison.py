@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from ..metrics.scoring import MEAN, MEDIAN, POOLED
+from .scoring import MEAN, MEDIAN, POOLED
 
 Over = Literal["rms", "mean", "median"]
 

@@ -1,4 +1,4 @@
-"""Rows that hold no reading: marks that devices write where they have none, and zeros."""
+"""Rows without a reading: a marker value that the device writes instead, and zeros on every axis."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from .channels import Channel
 from .neighbours import FEWEST, MAD_TO_SIGMA
 
 FEWEST_MARKED = 3
+"""Rows: two equal values may be chance."""
 MARKER_FAR = 20.0
-"""Spreads from the median beyond which a value that keeps coming back is no reading."""
+"""In robust sigmas from the median: a value that repeats exactly beyond this is a marker."""
 NEAR_ZERO = 0.1
-"""Of the median size: a stream that has readings there may well have some at zero."""
+"""Of the median size: a stream that has readings below this may well have some at zero."""
 
 
 @dataclass(frozen=True, eq=False)
-class Unread:
-    """Rows (n,) without a reading: those that hold the value `marker` on some axis, and those of zeros."""
+class MissingRows:
+    """Rows (n,) without a reading: those with the value `marker` on some axis, and those of zeros."""
 
     marked: NDArray[np.bool_]
     zero: NDArray[np.bool_]
@@ -33,13 +34,13 @@ class Unread:
 
 
 @lru_cache(maxsize=16)
-def unread_rows(channel: Channel) -> Unread:
-    """Find one value far outside the others that comes back exactly, and rows of zeros far from the rest."""
+def missing_rows(channel: Channel) -> MissingRows:
+    """Find a value far outside the others that repeats exactly, and rows of zeros far from the rest."""
     measured = np.isfinite(channel.sigma)
     x = channel.raw[:, measured]
     marked, zero, marker = np.zeros(len(x), bool), np.zeros(len(x), bool), 0.0
     if len(x) < FEWEST or x.shape[1] == 0:
-        return Unread(marked, zero)
+        return MissingRows(marked, zero)
     quanta = np.array([steps.quantum for steps in channel.steps])[measured]
     for axis, quantum in zip(x.T, quanta, strict=True):
         off = np.abs(axis - np.median(axis))
@@ -52,7 +53,7 @@ def unread_rows(channel: Channel) -> Unread:
         value, others = values[most], axis[axis != values[most]]
         change = np.abs(np.diff(others))
         usual = max(float(np.median(change[change > 0])) if change.any() else 0.0, quantum)
-        # nobody but marks, and the odd outlier with a value of its own; a reading would have come there bit by bit
+        # only markers and a few outliers lie out there; a true reading would have been reached gradually
         alone = np.abs(others - value).min() > MARKER_FAR * usual
         if alone and counts[most] >= max(FEWEST_MARKED, 0.5 * counts.sum()):
             marked |= axis == value
@@ -64,10 +65,10 @@ def unread_rows(channel: Channel) -> Unread:
         near = np.mean((np.abs(x[rest]) <= np.maximum(NEAR_ZERO * size, 1.5 * quanta)).all(axis=1))
         if zeros.sum() >= FEWEST_MARKED and near <= 0.5 * np.mean(zeros):
             zero = zeros
-    return Unread(marked, zero, marker)
+    return MissingRows(marked, zero, marker)
 
 
 def readings_of(channel: Channel) -> Channel:
-    """Return the channel without the rows that hold no reading."""
-    good = unread_rows(channel).readings
+    """Return the channel without the rows that `missing_rows` finds."""
+    good = missing_rows(channel).readings
     return channel if good.all() else channel.rows(good)

@@ -1,4 +1,4 @@
-"""What the sensors of a log say of each other: the cross-sensor checks, each where its sensors are there."""
+"""All checks of one sensor against another, for the sensors that a log has."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ from typing import Any
 
 from ....datasets.log import Log
 from ..findings.finding import Check
-from .answers import Answer
 from .clock import clock_check
 from .headings import gyro_against_heading, heading_against_truth
 from .inertial import inertial_of
 from .lever_arm import imu_against_dvl, mirrored_dvl, up_check
+from .pair_check import PairCheck
 from .path_fit import positions
 from .references import depth_against_truth, dvl_against_truth, gps_against_truth, reference_of, truth_against_itself
 from .velocity import dvl_against_positions
 
 
 def cross_checks(log: Log) -> list[Check]:
-    """Return a check for every pair of sensors that see the same; those that are absent, or too short, are left out.
+    """Return a check for every pair of sensors that see the same motion, if both are there for long enough.
 
-    Every estimate comes with a standard deviation that the data tell (`fitting`). A finding is raised where it differs
-    from what the description says beyond chance and by a size that matters. What to put into log.yaml comes on top of
-    what stands there: offsets and delays add, scales multiply.
+    Every estimate has a standard deviation taken from the data (`fitting`). A finding needs a difference from the
+    description that is larger than chance and large enough to matter. A fix is relative to what log.yaml has already:
+    offsets and delays add, scales multiply.
     """
     silent: dict[str, Any] = {name: None for name, stream in log.streams.items() if not len(stream)}
-    log = replace(log, **silent)  # a sensor that never spoke is none
+    log = replace(log, **silent)  # a stream without rows counts as absent
     imu, reference = inertial_of(log), reference_of(log)
-    answers: list[Answer | None] = []
+    answers: list[PairCheck | None] = []
     if log.dvl is None:
-        answers.append(Answer(up_check(log, imu)))
+        answers.append(PairCheck(up_check(log, imu)))
     if log.heading is not None:
         answers += [gyro_against_heading(log, imu), heading_against_truth(log)]
     if log.dvl is not None:
         if (mirrored := mirrored_dvl(log, imu)) is not None:
-            answer, log = mirrored  # the other checks go on with what it means
+            answer, log = mirrored  # the other checks use the corrected axes
             answers.append(answer)
         answers += [dvl_against_positions(log, imu, where) for where in positions(log, imu)]
         if reference is not None:

@@ -1,6 +1,6 @@
 """A simulated dive of 60 s keeps its numbers; when they move, the commit says why.
 
-`python tests/estimators/test_golden.py` writes them anew.
+`python tests/bench/test_golden.py` writes them anew.
 """
 
 from __future__ import annotations

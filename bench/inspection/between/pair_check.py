@@ -1,4 +1,4 @@
-"""What a cross-sensor check hands over: the check for the page, and the delays that the clock check weighs together."""
+"""The result of a check of two sensors: the check for the page, and the delays for the clock check to combine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .fitting import Estimate
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later `late` stamps what it saw than `than` does, s; negative: earlier."""
+    """By how much (s) the stamps of `late` are later than those of `than` for the same event; negative: earlier."""
 
     late: str
     than: str
@@ -18,8 +18,8 @@ class Delay:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A check and the delays that it met."""
+class PairCheck:
+    """A check and the delays that it measured."""
 
     check: Check
     delays: tuple[Delay, ...] = ()

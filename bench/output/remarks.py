@@ -1,0 +1,48 @@
+"""What a reader must know beside the numbers: runs that did not finish, and results not to be trusted; a line each."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from textwrap import shorten
+
+from ..results.summary import Record, groups
+
+CAUSE_WIDTH = 160
+"""Letters of a cause that a line shows: two lines of a terminal of 80 columns."""
+
+
+def failures(rows: Sequence[Record]) -> list[str]:
+    """Return a line for each run that did not finish; a recording that is not here has one line in all."""
+    lines = []
+    for (log, label, seed), (row, *_) in groups(rows, "log", "label", "seed").items():
+        if row["status"] == "absent":
+            lines.append(f"{log}: {row['cause']}")
+        elif row["status"] != "done":
+            of_seed = "" if seed is None else f" seed {seed}"
+            when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
+            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {shorten(row['cause'], CAUSE_WIDTH)}")
+    return list(dict.fromkeys(lines))
+
+
+def mostly_outside(rows: Sequence[Record]) -> list[str]:
+    """Return a line for each log most of whose readings lie outside the IMU's time."""
+    lines = {}
+    for row in rows:
+        counts = json.loads(row["counts"] or "{}")
+        outside, readings = counts.get("readings_outside", 0), counts.get("readings", math.inf)
+        if row["status"] == "done" and outside > readings / 2:
+            lines[row["log"]] = (
+                f"{row['log']}: {outside} of {readings} readings lay outside the log; correct the clock of their stream"
+            )
+    return list(lines.values())
+
+
+def not_positive(summary: Sequence[Record]) -> list[str]:
+    """Return a line for each output whose covariance is somewhere not positive definite."""
+    return [
+        f"{row['log']} / {row['label']} {row['output']}: {row['n_not_positive']} covariances are not positive definite"
+        for row in summary
+        if row["n_not_positive"]
+    ]

@@ -1,0 +1,341 @@
+"""The tables of an experiment, ready for the terminal, LaTeX and the report to lay out: headings, cells, notes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ..metrics import BLOCKS
+from ..metrics.floor_ratio import OVER
+from ..metrics.scoring import INNOVATIONS, MEDIAN
+from ..results.intervals import interval_over_seeds
+from ..results.paired import FEWEST_SEEDS
+from ..results.summary import OUTLIERS, Record, groups
+from .cells import (
+    ABSENT,
+    ACCURACY,
+    NEES_NOTE,
+    ONLINE,
+    Cell,
+    absent,
+    cell,
+    column,
+    interval,
+    lag,
+    output_and_lag,
+    percent,
+    scored_how,
+    signed,
+    text,
+)
+
+Done = Mapping[tuple[Any, ...], Sequence[Record]]
+"""By log, label and output, the rows that finished."""
+
+SHORT = {"position": "pos", "attitude": "att", "velocity": "vel", "biases": "bias", "heading": "head"}
+"""What narrow columns call blocks and sensors; others have their own names."""
+
+SHOWN_OF_IDENTITY = 8
+"""Letters of a run's identity that a table shows: enough to tell millions of runs apart."""
+
+
+class Line(NamedTuple):
+    """One row.
+
+    Attributes:
+        name: whose numbers these are.
+        output, lag: which output, in words and in short; empty in a table over all outputs.
+        lookahead_s: what outputs are sorted by; None goes last.
+        section: the score or the log that it is about, in a table of several.
+        run: its place among all rows of the store, in the table of runs.
+    """
+
+    name: str
+    cells: list[Cell]
+    output: str = ""
+    lag: str = ""
+    lookahead_s: float | None = None
+    section: str = ""
+    run: int | None = None
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table.
+
+    Attributes:
+        title: stands above it.
+        note: what its numbers mean, line by line.
+        headings: of the names, then of the cells; at most two lines each.
+        section: heading of the lines' sections; "" where there are none.
+    """
+
+    title: str
+    note: Sequence[str]
+    headings: Sequence[str]
+    lines: Sequence[Line]
+    section: str = ""
+
+    @property
+    def notes(self) -> list[str]:
+        """The note, and why cells are empty."""
+        why = dict.fromkeys(cell.why for line in self.lines for cell in line.cells if cell.why)
+        return [*self.note, *([f"{ABSENT}: {'; '.join(why)}"] if why else [])]
+
+    def by_output(self) -> dict[str, list[Line]]:
+        """Return the lines by section and output, the least lag first: only outputs of equal lag are ranked."""
+        sections = list(dict.fromkeys(line.section for line in self.lines))
+
+        def place(line: Line) -> tuple[int, bool, float, bool]:
+            seen = line.lookahead_s
+            return sections.index(line.section), seen is None, seen or 0.0, not line.output.startswith(ONLINE)
+
+        found: dict[str, list[Line]] = {}
+        for line in sorted(self.lines, key=place):
+            found.setdefault(", ".join(filter(None, (line.section, line.output))), []).append(line)
+        return found
+
+
+def _line(row: Record, cells: list[Cell], **other: Any) -> Line:
+    """Return the line of one output."""
+    seen = row["lookahead_s"]
+    return Line(row["label"], cells, output_and_lag(row["output"], seen), lag(seen), seen, **other)
+
+
+def _by_label(summary: Sequence[Record]) -> list[Record]:
+    return [row for of_label in groups(summary, "label").values() for row in of_label]
+
+
+def _runs(row: Record) -> Cell:
+    return Cell(f"{row['done']}", row["done"])
+
+
+def accuracy(summary: Sequence[Record], done: Done | None = None) -> Sheet:
+    """Return the main table of one log.
+
+    Args:
+        summary: of the log, as `summarise` gives it.
+        done: the rows behind it; with them, scores have intervals over seeds.
+    """
+    note = [scored_how(summary), NEES_NOTE]
+    if done is not None:
+        enough = max(row["done"] for row in summary) >= FEWEST_SEEDS
+        note.append(
+            "[ ]: 95 % bootstrap interval over seeds (with 20 seeds it holds in about 90 % of cases)"
+            if enough
+            else f"no intervals: they need {FEWEST_SEEDS} seeds"
+        )
+
+    def with_interval(score: str, row: Record) -> Cell:
+        known = None
+        if done is not None and score not in MEDIAN:  # the spread of costs is the machine's, not the seeds'
+            known = interval_over_seeds(done[row["log"], row["label"], row["output"]], score)
+        low, high = known or (None, None)
+        return cell(score, row)._replace(interval=interval(low, high, column(score).text))
+
+    lines = [
+        _line(
+            row,
+            [
+                Cell(f"{row['done']}/{row['runs']}", row["done"] / row["runs"]),
+                *(with_interval(each.score, row) for each in ACCURACY),
+            ],
+        )
+        for row in _by_label(summary)
+    ]
+    return Sheet(summary[0]["log"], note, ["estimator", "runs\ndone", *(each.heading for each in ACCURACY)], lines)
+
+
+def over_floor(summary: Sequence[Record]) -> Sheet | None:
+    """Return each RMSE over the posterior Cramér–Rao bound; None where no bound is known."""
+    if not any(row[floor] is not None for row in summary for _, floor in OVER.values()):
+        return None
+    note = [
+        "RMSE over the posterior Cramér–Rao bound at the same lag: 1 is the best possible",
+        f"[ ]: 95 % bootstrap interval over seeds, from {FEWEST_SEEDS} seeds on (with 20 it holds in 91 % of cases)",
+    ]
+
+    def ratio(row: Record, block: str) -> Cell:
+        value, low, high = (row[f"over_floor_{block}{part}"] for part in ("", "_low", "_high"))
+        if value is None:
+            return absent(f"over_floor_{block}", row)
+        return Cell(f"{value:.3f}", value, interval(low, high, "{:.3f}".format))
+
+    lines = [_line(row, [_runs(row), *(ratio(row, block) for block in OVER)]) for row in _by_label(summary)]
+    return Sheet(f"{summary[0]['log']}: RMSE over the floor", note, ["estimator", "runs", *OVER], lines)
+
+
+def consistency(summary: Sequence[Record]) -> Sheet | None:
+    """Return ANEES, NIS and coverage; None where there are none."""
+    sensors = [name for name in INNOVATIONS if any(row[name] is not None for row in summary)]
+    times = max((row["anees_times"] or 0 for row in summary), default=0)
+    if not sensors and not times:
+        return None
+    seeds = max(row["done"] for row in summary)
+    note = [
+        "squared errors over their covariance, per degree of freedom: 1 is consistent, more is overconfident",
+        f"ANEES: over {seeds} runs, at {times} fixed times; ▲k, ▼k: at k of them above, below the chi-square interval"
+        + ("" if seeds >= FEWEST_SEEDS else "; with so few seeds that interval is wide"),
+        "NIS: over all readings that came in time; position within 1, 2, 3 σ: 68, 95, 99.7 % if consistent",
+    ]
+
+    def anees(row: Record, block: str) -> Cell:
+        value, above, below = (row[f"anees_{block}{part}"] for part in ("", "_above", "_below"))
+        if value is None:
+            return absent(f"anees_{block}", row)
+        mark = (f"▲{above}" if above else "") + (f"▼{below}" if below else "")
+        return Cell(text(value), value, mark=mark)
+
+    def within(row: Record) -> Cell:
+        shares = [row[f"within_{k}sigma_position"] for k in (1, 2, 3)]
+        if None in shares:
+            return absent("within_1sigma_position", row)
+        percents = (f"{100 * share:.{decimals}f}" for share, decimals in zip(shares, (0, 0, 1), strict=True))
+        return Cell(" ".join(percents), shares[0])
+
+    headings = [
+        *("estimator", "runs", *(f"ANEES\n{SHORT.get(block, block)}" for block in BLOCKS)),
+        *(f"NIS\n{SHORT.get(sensor, sensor)}" for sensor in (name.removeprefix("nis_") for name in sensors)),
+        "within\n1, 2, 3 σ",
+    ]
+    lines = [
+        _line(
+            row,
+            [
+                _runs(row),
+                *(anees(row, block) for block in BLOCKS),
+                *(cell(name, row) for name in sensors),
+                within(row),
+            ],
+        )
+        for row in _by_label(summary)
+    ]
+    return Sheet(f"{summary[0]['log']}: consistency", note, headings, lines)
+
+
+def late_or_out(summary: Sequence[Record]) -> Sheet | None:
+    """Return what became of late readings and outliers; None where there were none."""
+    outliers = [name for name in summary[0] if name.startswith(OUTLIERS)]
+    counts = {"readings": "readings", "late_used": "late,\nused", "late_dropped": "late,\ndropped"}
+    counts |= {"carried": "carried"} | {name: f"outliers\n{name.removeprefix(OUTLIERS)}" for name in outliers}
+    if not any(row[name] for row in summary for name in ("late_used", "late_dropped", *outliers)):
+        return None
+    note = ["counts over all runs; carried: tied to the keyframe before by the IMU"]
+    if outliers:
+        note.append(
+            "outliers: rejected by a filter's gate, or beyond the width of a loss; of Gaussian readings Huber's has "
+            "18 %, Cauchy's 1.7 %"
+        )
+    lines = [
+        Line(label, [Cell(f"{row[name]:,}", row[name]) for name in counts])
+        for (label,), (row, *_) in groups(summary, "label").items()
+    ]
+    return Sheet(f"{summary[0]['log']}: late readings and outliers", note, ["estimator", *counts.values()], lines)
+
+
+def cost(summary: Sequence[Record]) -> Sheet | None:
+    """Return what each estimator costs; None where none made a step."""
+    if not any(row[name] is not None for row in summary for name in MEDIAN):
+        return None
+    lines = [
+        Line(label, [cell(name, row) for name in MEDIAN]) for (label,), (row, *_) in groups(summary, "label").items()
+    ]
+    note = ["medians over runs; × real time: length of the log over the time of all steps and of the finish"]
+    if any(row[name] is not None for row in summary for name in INNOVATIONS):
+        note.append(NOT_COMPARABLE)
+    headings = ["estimator", *(column(name).heading for name in MEDIAN)]
+    return Sheet(f"{summary[0]['log']}: cost", note, headings, lines)
+
+
+NOT_COMPARABLE = "costs are not comparable: NIS was asked for, which cuts every step in two"
+
+
+def every_run(rows: Sequence[Record]) -> Sheet:
+    """Return every run with its scores, and the first letters of its identity."""
+    places = {id(row): place for place, row in enumerate(rows)}
+    lines = [
+        _line(
+            row,
+            [
+                Cell(ABSENT if row["seed"] is None else f"{row['seed']:.0f}", row["seed"]),
+                Cell(row["status"] or ABSENT, row["status"]),
+                *(cell(each.score, row) for each in ACCURACY),
+                Cell((row["identity"] or ABSENT)[:SHOWN_OF_IDENTITY], row["identity"]),
+            ],
+            section=row["log"],
+            run=places[id(row)],
+        )
+        for row in rows
+    ]
+    note = ["one by one, not pooled; a row opens to its spec, its counts and where it was made"]
+    headings = ["estimator", "seed", "status", *(each.heading for each in ACCURACY), "identity"]
+    return Sheet("Every run", note, headings, lines, "log")
+
+
+# -- paired differences -----------------------------------------------------------------------------------------------
+
+
+def differences(paired: Sequence[Record]) -> list[Sheet]:
+    """Return a table per baseline of what `paired` found."""
+    headings = ["variant", "baseline", "Δ", "95 %", "%", "p\n(Holm)", "r", "seeds"]
+    note = _paired_note(paired)
+    return [
+        Sheet(f"{log}: against {label}", note, headings, [_difference(row) for row in _by_variant(rows)], "score")
+        for (log, label), rows in groups(paired, "baseline_log", "baseline_label").items()
+    ]
+
+
+def variant(row: Record) -> str:
+    """Return how the variant of a paired record is called beside its baseline: by its label or log, or by both."""
+    if row["log"] == row["baseline_log"]:
+        return row["label"]
+    return row["log"] if row["label"] == row["baseline_label"] else f"{row['log']}: {row['label']}"
+
+
+def _by_variant(paired: Sequence[Record]) -> list[Record]:
+    named = [row | {"variant": variant(row)} for row in paired]
+    return [row for rows in groups(named, "variant", "output").values() for row in rows]
+
+
+def _difference(row: Record) -> Line:
+    """Return the line of one score's difference."""
+    seen, other = row["lookahead_s"], row["baseline_lookahead_s"]
+    both = lag(seen) if lag(seen) == lag(other) else f"{lag(seen)} v. {lag(other)}"
+    seeds = Cell(f"{row['pairs']}" if row["pairs"] == row["runs"] else f"{row['pairs']}/{row['runs']}", row["pairs"])
+    if row["pairs"]:
+        p, r = row["p_holm"], row["rank_biserial"]
+        cells = [
+            Cell(text(row["baseline"]), row["baseline"]),
+            Cell(signed(row["difference"]), row["difference"]),
+            Cell(interval(row["low"], row["high"], signed) or ABSENT, row["low"]),
+            Cell(percent(row["ratio"]), row["ratio"]),
+            Cell(ABSENT if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p),
+            Cell(ABSENT if r is None else f"{r:+.2f}", r),
+        ]
+        output = output_and_lag(row["output"], seen)
+        output += "" if lag(seen) == lag(other) else f", against lag {lag(other)}"
+    else:
+        cells, output = [Cell(ABSENT, why="no seed that both finished")] * 6, "no seed that both finished"
+    return Line(variant(row), [*cells, seeds], output, both, seen, column(row["score"]).raw)
+
+
+def _paired_note(paired: Sequence[Record]) -> list[str]:
+    tests = [row for row in paired if row["p_holm"] is not None]
+    lines = [
+        "Δ: variant minus baseline, over the seeds that both finished; 95 %: bootstrap interval over seeds (with 20 "
+        "seeds it holds in 90 % of cases)"
+    ]
+    if not tests:
+        return [*lines, f"neither intervals nor tests: they need {FEWEST_SEEDS} seeds of a simulated log"]
+    lines.append(
+        f"p: Wilcoxon's signed-rank test over seeds, corrected by Holm for {len(tests)} tests; "
+        "r: its rank-biserial correlation, ±1 where all seeds agree"
+    )
+    least = min(len(tests) * 2.0 ** (1 - row["pairs"]) for row in tests)
+    if least > 0.05:
+        lines.append(
+            f"with so many tests on so few seeds there is no p under {min(1.0, least):.2g}: run more seeds, or compare "
+            "less"
+        )
+    return lines
