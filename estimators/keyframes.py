@@ -34,7 +34,7 @@ LEAST_AGE_NS = 500_000
 """A keyframe of just the window's age stays, for it has yet to see the new one; this allows for rounding of lag_s."""
 NO_READINGS = np.zeros(0, READING)
 
-KEYFRAME, AT_KEYFRAME, CARRIED, SUMMED, SOLVE = range(5)
+KEYFRAME, AT_KEYFRAME, CARRIED, SUMMED, SOLVE = np.arange(5)  # no literals, for which numba would compile anew
 """What an order, a row (what, keyframe, x), asks for:
 
     KEYFRAME        make this keyframe, at time x, and close the interval before it
