@@ -36,8 +36,8 @@ class GraphSmoother(ABC):
     is carried on by the IMU and corrected as in a filter; the graph does not use that.
 
     Attributes:
-        dvl: how DVL readings enter. "velocity": one velocity factor for each (eq. 4). "preintegrated-loose": readings
-            are summed to a displacement between keyframes (eq. 6), rotated by the gyro at its current bias, as if that
+        dvl: how DVL readings enter. "velocity": one velocity factor for each. "preintegrated-loose": readings
+            are summed to a displacement between keyframes, rotated by the gyro at its current bias, as if that
             gyro were independent of the IMU factor's. "preintegrated-tight": the same displacement, conditioned on the
             rotation between the keyframes and on the gyro bias, so that each gyro sample is used once. Name at most one
             of the two. Over a second they differ little; over 5 s with a consumer-grade gyro, loose is overconfident
