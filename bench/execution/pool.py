@@ -23,7 +23,7 @@ LogName: TypeAlias = tuple[str, int | None]
 
 
 class Queue:
-    """Waiting tasks, in order; but a worker keeps to the log it has in memory, while there are logs for the others."""
+    """Waiting tasks, in order; but a worker keeps to the log that it has in memory, if the others have logs too."""
 
     def __init__(self, tasks: Iterable[Task]) -> None:
         self._by_log: dict[LogName, deque[Task]] = {}

@@ -1,1 +1,1 @@
-"""How fast we are: budgets, benchmarks, comparison with another revision, and counts that no machine changes."""
+"""How fast fathom is: budgets, comparison with another revision, profiles, costs, and counts of work."""

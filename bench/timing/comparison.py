@@ -1,14 +1,13 @@
-"""Is this revision slower than that one? An answer that a noisy machine does not change.
+"""Compare the speed of two revisions, with a verdict that a busy machine does not change.
 
-Both revisions have a process each, and take turns, A B B A, so that whatever slows the machine slows both. Processor
-time is compared, for the neighbours' share of the clock is not ours, and of two turns of a side the faster one, for
-noise only adds. Two processes of the very same code still differ by some per cent, each for its whole life (where
-things lie in memory), which no taking turns removes: so there are several pairs of processes, and the interval is a
-bootstrap over pairs and, within them, over turns.
+Each revision has a process, and the two take turns A B B A, so that what slows the machine slows both. Processor time
+is compared, since other processes take their share of the clock; and of two turns of one side the faster one, since
+noise only adds. Two processes of the same code still differ by some per cent for as long as they live, by where things
+lie in memory. Taking turns does not remove that, so there are several pairs of processes. The interval is a bootstrap
+over pairs and, within them, over turns.
 
-The intervals hold for all benchmarks together (Bonferroni). What comes out slower than the limit is measured again,
-by twice as many new pairs of twice as many turns, and only that decides: slower is what has its whole second interval
-above the limit.
+The intervals hold for all benchmarks together (Bonferroni). A benchmark slower than the limit is measured again, by
+twice as many new pairs of twice as many turns. It counts as slower if its whole second interval is above the limit.
 """
 
 from __future__ import annotations
@@ -35,18 +34,18 @@ Array = NDArray[np.float64]
 Verdict = Literal["slower", "slower?", "same", "faster", "new", "broken"]
 
 CONFIDENCE = 0.95
-"""Of all intervals together."""
+"""That all intervals together hold."""
 
 LEAST_S = 0.02
-"""A turn is repeated until it takes this long: shorter ones measure the clock."""
+"""A turn is repeated until it takes this long, s: a shorter one measures the clock."""
 
 RESAMPLES = 5_000
-"""Ends of a 95 % interval are then the 125th from either side."""
+"""The ends of a 99.8 % interval are then the fifth resamples from either side."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: pairs of processes, and turns A B B A of each."""
+    """How much is measured: pairs of processes, and turns A B B A of each pair."""
 
     pairs: int
     rounds: int
@@ -57,21 +56,21 @@ class Effort:
 
 
 FULL, SHORT = Effort(5, 4), Effort(3, 3)
-"""Of a long and of a short benchmark."""
+"""Enough to find a slowdown of 20 % on a busy machine (`test_comparison`); the short one takes a minute or two."""
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One benchmark in both revisions.
+    """The result of one benchmark in both revisions.
 
     Attributes:
         name, group, unit: of the benchmark.
-        now_us, then_us: processor time per unit, the median over turns; None where it cannot run.
+        now_us, then_us: processor time per unit, µs, the median over turns; None where it cannot run.
         ratio, low, high: now over then, with its interval.
-        again: whether it was measured twice; the numbers are the second measurement's.
+        again: whether it was measured twice; the numbers are then those of the second time.
         verdict: "slower": the whole interval is above the limit; "slower?": only the ratio is; "faster": the whole
-            interval is below 1 over the limit; "new": that revision cannot do it; "broken": this one cannot.
-        note: why it cannot run, or that it was not the same amount of work.
+            interval is below 1 / limit; "new": the other revision cannot run it; "broken": the working tree cannot.
+        note: why it cannot run, or that the two did different amounts of work.
     """
 
     name: str
@@ -89,7 +88,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All that was compared, with what and how."""
+    """The result of all benchmarks, and how they were measured."""
 
     now: str
     then: str
@@ -100,7 +99,7 @@ class Comparison:
 
     @property
     def failed(self) -> bool:
-        """Whether anything is slower, or cannot run any more."""
+        """Whether anything is slower or broken."""
         return any(row.verdict in ("slower", "broken") for row in self.rows)
 
 
@@ -141,9 +140,9 @@ def compare(revision: str, chosen: Sequence[Benchmark], effort: Effort, limit: f
 def _warm_up(
     now: Side, then: Side, chosen: Sequence[Benchmark], progress: Progress
 ) -> tuple[dict[str, int], dict[str, Compared]]:
-    """Compile everything in both trees; return how often each benchmark repeats, and the rows of those that cannot run.
+    """Compile everything in both trees; return the repeats of each benchmark, and the rows of those that cannot run.
 
-    The processes that compiled end here: all that are timed load what was compiled, and are alike in that.
+    The processes that compiled end here. The processes that are timed load compiled code, all of them alike.
     """
     answers: list[dict[str, dict[str, Any]]] = []
     for side in (now, then):
@@ -176,7 +175,7 @@ def _measure(
     progress: Progress,
     again: bool = False,
 ) -> dict[str, Compared]:
-    """Let both sides take turns at every benchmark, and compare."""
+    """Time every benchmark on both sides, in turns, and compare."""
     seconds = {each.name: np.zeros((effort.pairs, effort.rounds, 4)) for each in chosen}
     units: dict[str, tuple[int, int]] = {}
     for pair in range(effort.pairs):
@@ -186,7 +185,7 @@ def _measure(
                     worker.send(prepare=each.name)
                 found = [worker.receive() for worker in workers]
                 if any("lacks" in one for one in found):
-                    raise TimingError(f"{each.name}: ran once and then did not: {found}")
+                    raise TimingError(f"{each.name}: ran the first time but not the second: {found}")
                 units[each.name] = (found[0]["units"], found[1]["units"])
             for turn in range(effort.rounds):
                 done = (pair + turn / effort.rounds) / effort.pairs
@@ -213,7 +212,7 @@ def _measure(
 
 
 def verdict_of(ratio: float, low: float, high: float, limit: float) -> Verdict:
-    """Return what a ratio with its interval says."""
+    """Return the verdict on a ratio with its interval."""
     if low > limit:
         return "slower"
     if ratio > limit:
@@ -224,7 +223,8 @@ def verdict_of(ratio: float, low: float, high: float, limit: float) -> Verdict:
 def ratio_of(seconds: Array, level: float, seed: int = 0) -> tuple[float, float, float]:
     """Return now over then, and its bootstrap interval.
 
-    The median over all turns of the faster of two calls; pairs are drawn again, and turns within each pair.
+    The ratio is the median over all turns, of the faster of two calls. The bootstrap resamples pairs, and turns within
+    each pair.
 
     Args:
         seconds: (pairs, rounds, 4); the last axis is now, now, then, then.
@@ -244,7 +244,7 @@ def ratio_of(seconds: Array, level: float, seed: int = 0) -> tuple[float, float,
 def print_comparison(
     revision: str, only: str | None, short: bool, limit: float, rounds: int, pairs: int, out: Path | None
 ) -> bool:
-    """Compare with a revision, print and save what came out, and return whether nothing is slower.
+    """Compare with a revision, print and save the result, and return whether nothing is slower.
 
     Raises:
         TimingError: nothing can be compared.

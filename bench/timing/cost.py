@@ -1,4 +1,4 @@
-"""What each estimator costs: the README's table, and accuracy against cost, from the runs of an experiment."""
+"""The cost of each estimator, from the runs of an experiment: the README's table, and accuracy against cost."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ COLUMNS = (
     "memory, MB",
 )
 BEGIN, END = "<!-- cost: fathom timing cost -->", "<!-- /cost -->"
-"""Between these two lines of a page stands the table."""
+"""The table stands between these two lines of a page."""
 BOOTSTRAPS = 2000
 """Resamples: the ends of a 95 % interval are then the 50th from either side."""
 
 
 def cost_records(rows: pd.DataFrame) -> list[Record]:
-    """Return what each estimator costs at each of its lags: medians over its runs, which are done one at a time.
+    """Return the cost of each estimator at each of its lags: medians over its runs, made one at a time.
 
     Each has `estimator`, `lag_s` (0: none; infinite: the whole log), `us_per_imu_sample`, `ms_per_keyframe` (None for
-    what makes none), `real_time_factor`, `peak_mb`, `runs`. Steps and `finish` are charged, beliefs are not.
+    an estimator without keyframes), `real_time_factor`, `peak_mb`, `runs`. Steps and `finish` count, beliefs do not.
     """
     done = [row for row in records(rows) if row["status"] == "done" and row["total_s"] is not None]
     found = []
@@ -73,7 +73,7 @@ def _median(values: Sequence[float | None]) -> float | None:
 def cost_markdown(rows: pd.DataFrame) -> str:
     """Return the table in Markdown, between its two marks, with the machine and the versions under it.
 
-    An estimator that ran at several lags has one line: what is not by lag is that of the first of LAGS_S.
+    An estimator that ran at several lags has one line. Columns that are not by lag are for the first of LAGS_S.
     """
     costs = cost_records(rows)
     lines = [BEGIN, "", _line(COLUMNS), _line(["---", *["---:"] * (len(COLUMNS) - 1)])]
@@ -108,7 +108,7 @@ def _figures(value: float | None) -> str:
 
 
 def _conditions(rows: pd.DataFrame, costs: Sequence[Record]) -> str:
-    """Return on which machine, with which versions, and of what the numbers are."""
+    """Return machine, versions and runs that the numbers are from, in words."""
     run = [row for row in records(rows) if row["status"] == "done"]
     machines = " and ".join(sorted({machine_text(row["machine"], row["versions"]) for row in run}))
     logs = ", ".join(sorted({f"{row['log']}, {row['duration_s']:.0f} s" for row in run}))
@@ -120,9 +120,9 @@ def _conditions(rows: pd.DataFrame, costs: Sequence[Record]) -> str:
 
 
 def draw_accuracy_cost(rows: pd.DataFrame) -> Figure:
-    """Draw ATE against computing per second of voyage, a panel per log: filled at once, open with hindsight.
+    """Draw ATE against computing per second of voyage, a panel per log: online filled, smoothed open.
 
-    One look per estimator, its lags joined. The bars are 95 % bootstrap intervals over the seeds of the pooled RMSE.
+    One look per estimator; its lags are joined. The bars are 95 % bootstrap intervals of the pooled RMSE.
     """
     done = [row for row in records(rows) if row["status"] == "done" and row["ate_rmse_m"] is not None]
     looks = looks_of([name for (name,) in groups(done, "estimator")])
@@ -148,7 +148,7 @@ def draw_accuracy_cost(rows: pd.DataFrame) -> Figure:
 
 
 def _draw_line(axes: Any, rows: Sequence[Record], look: Look, online: bool) -> None:
-    """Draw one estimator's output, its lags joined and, at hindsight, named."""
+    """Draw one output of an estimator, its lags joined and, if it is smoothed, named."""
     points = []
     for (label,), runs in groups(rows, "label").items():
         x_ms = median(1e3 / row["real_time_factor"] for row in runs)
@@ -166,7 +166,7 @@ def _draw_line(axes: Any, rows: Sequence[Record], look: Look, online: bool) -> N
 
 
 def _pooled_with_interval(runs: Sequence[Record]) -> tuple[float, float, float]:
-    """Return the ATE pooled over the seeds, and its 95 % bootstrap interval; without width where there is one seed."""
+    """Return the ATE pooled over the seeds, and its 95 % bootstrap interval; of one seed it has no width."""
     rmse, n = (np.array([row[key] for row in runs], float) for key in ("ate_rmse_m", "n_scored"))
     draws = np.random.default_rng(0).integers(0, len(runs), (BOOTSTRAPS, len(runs)))
     pooled = np.sqrt((n * rmse**2)[draws].sum(axis=1) / n[draws].sum(axis=1))

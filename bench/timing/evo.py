@@ -1,4 +1,4 @@
-"""Our ATE and RPE beside evo's: the same numbers, and how much longer evo takes for them. evo is a tool for tests."""
+"""Compare our ATE and RPE with those of evo: the same numbers, and how much longer evo takes. evo is for tests only."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
 
 @dataclass(frozen=True)
 class Compared:
-    """evo's time over each of ours, and the largest difference of any statistic."""
+    """Time of evo over each of ours, and the largest difference of any statistic."""
 
     ratios: tuple[float, ...]
     largest_difference: float
 
 
 def compare(n: int, repeats: int = 5) -> Compared:
-    """Score n poses by both: RPE over 1 m, all pairs; ours runs before and after evo.
+    """Score n poses by both, RPE over 1 m and all pairs; ours runs before and after evo.
 
     Raises:
         ModuleNotFoundError: evo is not installed.
@@ -50,7 +50,7 @@ def compare(n: int, repeats: int = 5) -> Compared:
 
 
 def tracks(n: int) -> tuple[Trajectory, Trajectory]:
-    """Return a random walk of n poses and an estimate of it that errs."""
+    """Return a random walk of n poses, and an estimate of it with errors."""
     rng = np.random.default_rng(0)
     R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.1, (n, 3)), axis=0))
     p_WB_W = np.cumsum(rng.normal(0, 0.2, (n, 3)), axis=0)

@@ -29,9 +29,9 @@ class Tree:
 
     Attributes:
         name: what to call it.
-        root: its folder.
-        python: its interpreter.
-        environment: where its dependencies come from, in a sentence.
+        root: folder of its checkout.
+        python: interpreter to run it with.
+        environment: where its dependencies come from, in words.
     """
 
     name: str
@@ -129,7 +129,7 @@ def working_tree() -> Tree:
 
 @contextmanager
 def checked_out(revision: str, folder: Path) -> Iterator[Tree]:
-    """Give a revision as a worktree within `folder`, a temporary one; it is gone afterwards, whatever happens.
+    """Check a revision out as a worktree within `folder`, a temporary one; it is removed afterwards, whatever happens.
 
     Raises:
         TimingError: there is no such revision, or its dependencies cannot be installed.
@@ -155,7 +155,7 @@ def checked_out(revision: str, folder: Path) -> Iterator[Tree]:
 
 
 def _environment(tree: Path, folder: Path) -> tuple[Path, str]:
-    """Return the interpreter for a tree, and why: this one where all that a run imports is pinned alike."""
+    """Return the interpreter for a tree, and why; it is ours if both pin alike what a run imports."""
     if _dependencies(tree) == _dependencies(ROOT):
         return Path(sys.executable), "this environment: the same dependencies, pinned alike"
     python = folder / "bin" / "python"
@@ -172,7 +172,7 @@ def _environment(tree: Path, folder: Path) -> tuple[Path, str]:
 
 
 def _dependencies(tree: Path) -> tuple[list[str], dict[str, str]]:
-    """Return what a tree's pyproject.toml asks for, and the pins of all that this brings along."""
+    """Return the dependencies in a tree's pyproject.toml, and the pins of these and of what they need."""
     project = tomllib.loads((tree / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted: list[str] = sorted(project["dependencies"])
     pins: dict[str, str] = {}
@@ -184,7 +184,7 @@ def _dependencies(tree: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def _brought_along(wanted: list[str]) -> set[str]:
-    """Return the names of packages and, as far as they are installed here, of all that these need."""
+    """Return the names of packages and of all that they need, as far as they are installed here."""
     found: set[str] = set()
     waiting = list(wanted)
     while waiting:
@@ -202,7 +202,7 @@ def _canonical(name: str) -> str:
 
 
 def _remove_stale() -> None:
-    """Remove the worktrees of comparisons that were killed."""
+    """Remove the worktrees that killed comparisons left behind."""
     _git("worktree", "prune")
     for line in (_git("worktree", "list", "--porcelain") or "").splitlines():
         path = Path(line.removeprefix("worktree "))
@@ -224,7 +224,7 @@ def _is_alive(process: int) -> bool:
 
 
 def _git(*arguments: str) -> str | None:
-    """Return what git says, or None where it fails."""
+    """Return the output of git, or None if it fails."""
     try:
         done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
     except OSError:

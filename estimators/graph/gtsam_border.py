@@ -15,19 +15,34 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
-from numba import njit
 from numpy.typing import NDArray
 
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
-from ...datasets.state import ACCEL_BIAS, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
+from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged, unknown_kind
+from ..physics.blocks import TOP, identity, rows_times, set_block
+from ..physics.compiled import compiled, inner
 from ..physics.dvl_preintegration import given_rotation
 from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
-from ..physics.so3 import cross, exp, inverse_right_jacobian, inverse_transform, log, product, right_jacobian, transform
-from ..physics.state import STATE, local
+from ..physics.so3 import (
+    cross_into,
+    exp_into,
+    inverse_right_jacobian_into,
+    inverse_transform_into,
+    log,
+    log_into,
+    product,
+    product_into,
+    right_jacobian,
+    right_jacobian_into,
+    transform_into,
+)
+from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, THETA_0, VELOCITY_0, local
 from ..stages import stage
 
+OF_PLACE, OF_GYRO = np.int64(3), np.int64(3)
+"""Where the translation begins in GTSAM's pose tangent, and the gyro in its bias."""
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
 """For factors that do not depend on velocity or bias."""
@@ -37,7 +52,7 @@ INTEGRATION_DENSITY = 1e-5
 """m/√s: GTSAM wants some; ten micrometres in a second keep a block of one sample regular."""
 
 
-@njit(cache=True)
+@compiled
 def equivalent_samples(
     imu: NDArray[Any], before: NDArray[Any], rig: NDArray[Any], block: NDArray[Any]
 ) -> tuple[Array, Array, Array]:
@@ -55,34 +70,48 @@ def equivalent_samples(
         accel (n, 3) m/s², gyro (n, 3) rad/s in B axes, the block's biases put back in; dt (n,) s.
     """
     g, b, n = rig[0], block[0], len(imu)
-    rates, forces, dts = unbiased(imu, before, b.b_a, b.b_g, g.R_BI)
-    accel, gyro, vectors = np.empty((n, 3)), np.empty((n, 3)), np.zeros((6, 3))
+    rates, forces, dts = unbiased(imu, before, b.b_a[:], b.b_g[:], g.R_BI[:])
+    accel, gyro, matrices, vectors = np.empty((n, 3)), np.empty((n, 3)), np.empty((4, 3, 3)), np.zeros((11, 3))
     phi, push, drift, theta, v, p = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]
-    R = np.eye(3)
-    R_last = R
+    rate_arm, lever, step, reached, lacking = vectors[6], vectors[7], vectors[8], vectors[9], vectors[10]
+    R, R_last, turn, J = matrices[0], matrices[1], matrices[2], matrices[3]
+    identity(R)
     for k in range(n):
         dt = dts[k + 1]
         increments(rates, forces, dts, k, phi, push, drift)
-        turn = exp(phi)
-        before_arm, after_arm = cross(rates[k], g.p_BI_B), transform(turn, cross(rates[k + 1], g.p_BI_B))
+        exp_into(phi, turn)
+        cross_into(rates[k + 1], g.p_BI_B[:], rate_arm)
+        transform_into(turn, rate_arm, lever)
+        cross_into(rates[k], g.p_BI_B[:], rate_arm)
         for i in range(3):
-            push[i] += before_arm[i] - after_arm[i]
-        dv = transform(R, push)
-        R_last, R = R, product(R, turn)
-        reached = log(R)
-        missing = np.empty(3)
+            push[i] += rate_arm[i] - lever[i]
+            for j in range(3):
+                R_last[i, j] = R[i, j]
+        product_into(R_last, turn, R)
+        transform_into(R_last, push, step)
         for i in range(3):
-            p[i] += dt * v[i] + 0.5 * dt * dv[i]
-            v[i] += dv[i]
-            missing[i] = reached[i] - theta[i]
-        step = transform(right_jacobian(theta), missing)
+            p[i] += dt * v[i] + 0.5 * dt * step[i]
+            v[i] += step[i]
+        log_into(R, reached)
+        right_jacobian_into(theta, J)
+        for i in range(3):
+            lever[i] = reached[i] - theta[i]
+        transform_into(J, lever, step)
         for i in range(3):
             gyro[k, i], accel[k, i], theta[i] = step[i] / dt, push[i] / dt, reached[i]
     if n > 1:
-        lacking = (b.dp - p) / (b.T - 0.5 * (dts[1] + dts[n]))
-        accel[0] += lacking / dts[1]
-        accel[n - 1] -= inverse_transform(R_last, lacking) / dts[n]
-    return accel + transform(g.R_BI, b.b_a), gyro + transform(g.R_BI, b.b_g), dts[1:]
+        for i in range(3):
+            lacking[i] = (b.dp[i] - p[i]) / (b.T - 0.5 * (dts[1] + dts[n]))
+        inverse_transform_into(R_last, lacking, step)
+        for i in range(3):
+            accel[0, i] += lacking[i] / dts[1]
+            accel[n - 1, i] -= step[i] / dts[n]
+    for k in range(n):
+        for i in range(3):
+            for j in range(3):
+                accel[k, i] += g.R_BI[i, j] * b.b_a[j]
+                gyro[k, i] += g.R_BI[i, j] * b.b_g[j]
+    return accel, gyro, dts[1:]
 
 
 @stage("propagation")
@@ -116,34 +145,33 @@ def preintegrate_imu(
     return preintegrated
 
 
-@njit(cache=True)
-def _as_state(pose: Array, v_WB_W: Array, bias: Array, R_BI: Array) -> NDArray[Any]:
-    state = np.zeros(1, STATE)
-    _fill(state, pose, v_WB_W, inverse_transform(R_BI, bias[0:3]), inverse_transform(R_BI, bias[3:6]))
-    return state
-
-
-@njit(cache=True)
-def _fill(state: NDArray[Any], pose: Array, v_WB_W: Array, b_a: Array, b_g: Array) -> None:
+@inner
+def _fill_state(pose: Array, v_WB_W: Array, bias: Array, R_BI: Array, state: NDArray[Any]) -> None:
+    """Fill a STATE record, but for P, from GTSAM's pose (4, 4), velocity and bias (6,)."""
     s = state[0]
-    s.R_WB[:], s.p_WB_W[:] = pose[0:3, 0:3], pose[0:3, 3]
-    s.v_WB_W[:], s.b_a[:], s.b_g[:] = v_WB_W, b_a, b_g
+    for i in range(3):
+        s.p_WB_W[i], s.v_WB_W[i], s.b_a[i], s.b_g[i] = pose[i, 3], v_WB_W[i], 0.0, 0.0
+        for j in range(3):
+            s.R_WB[i, j] = pose[i, j]
+            s.b_a[i] += R_BI[j, i] * bias[j]
+            s.b_g[i] += R_BI[j, i] * bias[OF_GYRO + j]
 
 
-@njit(cache=True)
-def _by_gtsam(H: Array, R_WB: Array, R_BI: Array) -> tuple[Array, Array, Array]:
-    """Split a Jacobian (n, 15) by our error state into those by GTSAM's pose, velocity and bias."""
-    n = len(H)
-    H_x, H_b = np.empty((n, 6)), np.empty((n, 6))
+@compiled
+def _by_gtsam(n: int, H: Array, pose: Array, R_BI: Array) -> tuple[Array, Array, Array]:
+    """Split n rows of a Jacobian by our error state into those by GTSAM's pose, velocity and bias."""
+    H_x, H_v, H_b = np.zeros((n, 6)), np.empty((n, 3)), np.zeros((n, 6))
     for i in range(n):
-        H_x[i, 0:3] = H[i, THETA]
-        H_x[i, 3:6] = inverse_transform(R_WB, H[i, POSITION])
-        H_b[i, 0:3] = transform(R_BI, H[i, ACCEL_BIAS])
-        H_b[i, 3:6] = transform(R_BI, H[i, GYRO_BIAS])
-    return H_x, H[:, VELOCITY].copy(), H_b
+        for j in range(3):
+            H_x[i, j], H_v[i, j] = H[i, THETA_0 + j], H[i, VELOCITY_0 + j]
+            for k in range(3):
+                H_x[i, OF_PLACE + j] += pose[k, j] * H[i, POSITION_0 + k]
+                H_b[i, j] += R_BI[j, k] * H[i, ACCEL_BIAS_0 + k]
+                H_b[i, OF_GYRO + j] += R_BI[j, k] * H[i, GYRO_BIAS_0 + k]
+    return H_x, H_v, H_b
 
 
-@njit(cache=True)
+@compiled
 def _linearise(
     reading: NDArray[Any],
     block: NDArray[Any],
@@ -154,28 +182,34 @@ def _linearise(
     rig: NDArray[Any],
 ) -> tuple[Array, Array, Array, Array]:
     """Residual of a reading, carried over `block` first, and its Jacobians by the pose, velocity and bias of i."""
-    state = _as_state(pose, v_WB_W, bias, rig[0].R_BI)
-    r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
+    state, R_BI = np.empty(1, STATE), rig[0].R_BI[:]
+    r, H, H_i, C, F = np.empty(3), np.empty((3, DIM)), np.empty((3, DIM)), np.empty((3, 3)), np.empty((DIM, DIM))
+    _fill_state(pose, v_WB_W, bias, R_BI, state)
+    identity(F)
     if carried:
-        F = np.empty((15, 15))
         predict(block, state, rig[0].gravity, F, state)
-        n = measure(reading, 0, state, rig, r, H, C)
-        H[:n] = H[:n] @ F
-    else:
-        n = measure(reading, 0, state, rig, r, H, C)
-    H_x, H_v, H_b = _by_gtsam(H[:n], pose[0:3, 0:3], rig[0].R_BI)
+    n = measure(reading, TOP, state, rig, r, H, C)
+    rows_times(n, H, F, H_i)
+    H_x, H_v, H_b = _by_gtsam(n, H_i, pose, R_BI)
     return r[:n].copy(), H_x, H_v, H_b
 
 
-@njit(cache=True)
+@compiled
 def _carried_covariance(reading: NDArray[Any], block: NDArray[Any], state: NDArray[Any], rig: NDArray[Any]) -> Array:
     """Covariance of a reading's residual, with the noise of the block that carries the keyframe to it."""
-    F, Q, end = np.empty((15, 15)), np.empty((15, 15)), state.copy()
-    r, H, C = np.empty(3), np.empty((3, 15)), np.empty((3, 3))
+    F, Q, end = np.empty((DIM, DIM)), np.empty((DIM, DIM)), state.copy()
+    r, H, HQ, C = np.empty(3), np.empty((3, DIM)), np.empty((3, DIM)), np.empty((3, 3))
     predict(block, state, rig[0].gravity, F, end)
-    process_noise(block, state[0].R_WB, Q)
-    n = measure(reading, 0, end, rig, r, H, C)
-    return H[:n] @ Q @ H[:n].T + C[:n, :n]
+    process_noise(block, state[0].R_WB[:], Q)
+    n = measure(reading, TOP, end, rig, r, H, C)
+    rows_times(n, H, Q, HQ)
+    cov = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            cov[i, j] = C[i, j]
+            for k in range(DIM):
+                cov[i, j] += HQ[i, k] * H[j, k]
+    return cov
 
 
 @stage("linearisation")
@@ -253,12 +287,25 @@ def carried_factor(
     return gtsam.CustomFactor(model, [X(i), V(i), B(i)], callback)
 
 
-@njit(cache=True)
+@inner
+def _split_pose(pose: Array) -> tuple[Array, Array]:
+    """Return R_WB and p_WB_W of a pose (4, 4)."""
+    R_WB, p_WB_W = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        p_WB_W[i] = pose[i, 3]
+        for j in range(3):
+            R_WB[i, j] = pose[i, j]
+    return R_WB, p_WB_W
+
+
+@compiled
 def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple[Array, Array, Array]:
-    H_i, H_j = np.empty((3, 15)), np.empty((3, 15))
-    R_i, R_j = pose_i[0:3, 0:3].copy(), pose_j[0:3, 0:3].copy()
-    r = preintegrated_dvl_residual(R_i, pose_i[0:3, 3].copy(), pose_j[0:3, 3].copy(), dp_ij, H_i, H_j)
-    return r, _by_gtsam(H_i, R_i, np.eye(3))[0], _by_gtsam(H_j, R_j, np.eye(3))[0]
+    """Residual, and its Jacobians by the pose of i and that of j."""
+    H_i, H_j, R_BI = np.empty((3, DIM)), np.empty((3, DIM)), np.empty((3, 3))
+    identity(R_BI)  # biases are not involved
+    (R_i, p_i), (_, p_j) = _split_pose(pose_i), _split_pose(pose_j)
+    r = preintegrated_dvl_residual(R_i, p_i, p_j, dp_ij, H_i, H_j)
+    return r, _by_gtsam(len(H_i), H_i, pose_i, R_BI)[0], _by_gtsam(len(H_j), H_j, pose_j, R_BI)[0]
 
 
 @stage("linearisation")
@@ -276,17 +323,19 @@ def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.Custo
     return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], callback)
 
 
-@njit(cache=True)
+@compiled
 def _linearise_tight_displacement(
     displacement: NDArray[Any], K: Array, pose_i: Array, pose_j: Array, bias: Array, R_BI: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Residual, and its Jacobians by the pose of i, that of j, and the bias of i."""
-    H_i, H_j = np.empty((3, 15)), np.empty((3, 15))
-    R_i, R_j, b_g = pose_i[0:3, 0:3].copy(), pose_j[0:3, 0:3].copy(), inverse_transform(R_BI, bias[3:6])
-    p_i, p_j = pose_i[0:3, 3].copy(), pose_j[0:3, 3].copy()
+    H_i, H_j, b_g = np.empty((3, DIM)), np.empty((3, DIM)), np.zeros(3)
+    (R_i, p_i), (R_j, p_j) = _split_pose(pose_i), _split_pose(pose_j)
+    for i in range(3):
+        for j in range(3):
+            b_g[i] += R_BI[j, i] * bias[OF_GYRO + j]
     r = tight_dvl_residual(R_i, p_i, b_g, R_j, p_j, displacement, K, H_i, H_j)
-    H_x, _, H_b = _by_gtsam(H_i, R_i, R_BI)
-    return r, H_x, _by_gtsam(H_j, R_j, R_BI)[0], H_b
+    H_x, _, H_b = _by_gtsam(len(H_i), H_i, pose_i, R_BI)
+    return r, H_x, _by_gtsam(len(H_j), H_j, pose_j, R_BI)[0], H_b
 
 
 @stage("linearisation")
@@ -313,21 +362,18 @@ def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: N
     return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], callback)
 
 
-@njit(cache=True)
-def _prior_error(mean: NDArray[Any], state: NDArray[Any], r: Array, H: Array) -> None:
-    """Fill r (15,) = state ⊖ mean, and H (15, 15), its derivative by the state's error."""
-    local(mean, state, r)
-    H[:] = np.eye(15)
-    H[THETA, THETA] = inverse_right_jacobian(r[THETA])
-
-
-@njit(cache=True)
+@compiled
 def _linearise_prior(
     mean: NDArray[Any], pose: Array, v_WB_W: Array, bias: Array, R_BI: Array
 ) -> tuple[Array, Array, Array, Array]:
-    r, H = np.empty(15), np.empty((15, 15))
-    _prior_error(mean, _as_state(pose, v_WB_W, bias, R_BI), r, H)
-    H_x, H_v, H_b = _by_gtsam(H, pose[0:3, 0:3], R_BI)
+    """Return r (15,) = state ⊖ mean, and its Jacobians by the pose, velocity and bias."""
+    r, H, J, state = np.empty(DIM), np.empty((DIM, DIM)), np.empty((3, 3)), np.empty(1, STATE)
+    _fill_state(pose, v_WB_W, bias, R_BI, state)
+    local(mean, state, r)
+    identity(H)
+    inverse_right_jacobian_into(r[THETA], J)
+    set_block(H, THETA_0, THETA_0, 1.0, J)
+    H_x, H_v, H_b = _by_gtsam(len(H), H, pose, R_BI)
     return r, H_x, H_v, H_b
 
 
@@ -396,7 +442,7 @@ def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array
             nothing has measured, seen in axes a hundredth of a radian off, would outweigh what depth says.
     """
     R_at = R_WB if R_WB_linearised is None else R_WB_linearised
-    G = np.zeros((15, 15))
+    G = np.zeros((DIM, DIM))
     G[THETA, THETA], G[VELOCITY, VELOCITY] = right_jacobian(log(product(R_at.T, R_WB))), np.eye(3)
     G[POSITION, POSITION] = R_at
     G[ACCEL_BIAS, ACCEL_BIAS] = G[GYRO_BIAS, GYRO_BIAS] = R_BI.T

@@ -41,3 +41,15 @@ def set_product(M: Array, row: int, column: int, scale: float, A: Array, B: Arra
     for i in range(3):
         for j in range(3):
             M[row + i, column + j] = scale * (A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j])
+
+
+@compiled
+def rows_times(n: int, H: Array, F: Array, out: Array) -> None:
+    """out = H F for n rows; F is square."""
+    for i in range(n):
+        for j in range(F.shape[1]):
+            out[i, j] = 0.0
+        for k in range(F.shape[0]):
+            if H[i, k] != 0.0:
+                for j in range(F.shape[1]):
+                    out[i, j] += H[i, k] * F[k, j]

@@ -92,6 +92,7 @@ def test_a_keyframe_of_just_the_windows_age_stays() -> None:
 def test_an_interval_sums_from_the_reading_at_its_beginning_to_the_last_before_its_end() -> None:
     one = keyframes(dvl=["preintegrated-loose"], keyframe_period_s=0.5)
     orders = [order for t in range(100, 1001, 100) for order in at(one, t, (DVL, t))]
+    assert one.not_given_out() == []  # the reading at the beginning is not to be used by itself as well
     assert [t for what, k, t in orders if (what, k) == (SUMMED, 0)] == [100, 200, 300, 400]
     assert [t for what, k, t in orders if (what, k) == (SUMMED, 1)] == [500, 600, 700, 800, 900]
     straight = keyframes(dvl=["preintegrated-loose"], keyframe_period_s=0.5, dvl_between="straight")
@@ -216,6 +217,7 @@ def test_no_reading_is_lost_or_used_twice_and_each_goes_to_its_own_keyframe(
     for reading in told:
         ways = [what for what, _ in reading.given]
         assert ways.count(AT_KEYFRAME) + ways.count(CARRIED) <= 1
+        assert len(ways) <= 1 or SUMMED not in ways or config.dvl_between == "straight"
         if config.dvl == {"velocity"} or reading.kind != DVL:
             assert SUMMED not in ways
         for what, k in reading.given:

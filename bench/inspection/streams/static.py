@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.log import Log
+from ....datasets.rig import EARTH_RATE_RADPS
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
 from ..findings.panels import AXIS_COLOURS, thinned
@@ -33,8 +34,6 @@ SHORTEST_S = 5.0
 """Over less, a gyro's white noise hides the turn-on bias that is read there."""
 SIGMAS = 4.0
 """Of the stated turn-on bias: normal biases exceed it once in 16,000."""
-EARTH_RAD_S = 7.3e-5
-"""The Earth's rate, which a gyro at rest reads."""
 
 
 class Rest(NamedTuple):
@@ -174,7 +173,7 @@ def _bias(log: Log, bias: Array, total_s: float) -> list[Finding]:
     noise = log.rig.imu_noise
     largest = float(np.abs(bias).max())
     chance = noise.gyro_density / np.sqrt(total_s)
-    if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RAD_S:
+    if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RATE_RADPS:
         return []
     message = (
         "At rest the gyro reads ({:.4g}, {:.4g}, {:.4g}) rad/s".format(*bias)
