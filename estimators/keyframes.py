@@ -287,11 +287,10 @@ def close(
     """Order a keyframe at t_ns, give out the readings that waited for it, and say which keyframes leave."""
     p = plan[0]
     last, new = p.newest, p.newest + 1
-    begin_ns = times[last & (len(times) - 1)]
     times[new & (len(times) - 1)] = t_ns
     p.newest = new
     order(plan, orders, KEYFRAME, new, t_ns)
-    placed, summable, longest_ns, before_ns = p.orders, True, 0, begin_ns
+    first = p.orders
     for row in range(p.rows):
         at_ns, role = rows[row].t_ns, roles[row]
         if role == GONE or at_ns > t_ns + p.merge_ns:
@@ -305,26 +304,19 @@ def close(
             roles[row] = BEGINS
         if not at_new or p.straight:
             order(plan, orders, SUMMED, last, row)
-            for i in range(3):
-                summable = summable and np.isfinite(rows[row].sigma[i])
-    sort_sum(plan, rows, orders, placed)
-    n = 0
-    for k in range(placed, p.orders):
-        if orders[k, 0] == SUMMED:
-            n += 1
-            longest_ns, before_ns = max(longest_ns, rows[orders[k, 2]].t_ns - before_ns), rows[orders[k, 2]].t_ns
-    if n and summable and max(longest_ns, t_ns - before_ns) <= p.hold_ns:
-        p.preintegrated += n
-    elif n:
-        place_one_by_one(plan, times, rows, orders, p.orders - n, t_ns)
+    first = sort_sum(plan, rows, orders, first)
+    if has_sum(plan, rows, orders, first, times[last & (len(times) - 1)], t_ns):
+        p.preintegrated += p.orders - first
+    else:
+        place_one_by_one(plan, times, rows, orders, first, t_ns)
     while p.oldest < new and times[p.oldest & (len(times) - 1)] < t_ns - p.window_ns:
         p.oldest += 1
     order(plan, orders, SOLVE, new, p.oldest)
 
 
 @inner
-def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], first: int) -> None:
-    """Bring the readings to sum behind the others, in the order of their times; all else keeps its order."""
+def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], first: int) -> int:
+    """Bring the readings to sum behind the others, in the order of their times; return where they begin."""
     for k in range(first + 1, plan[0].orders):
         what, keyframe, row = orders[k, 0], orders[k, 1], orders[k, 2]
         j = k
@@ -337,15 +329,33 @@ def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], 
                 orders[j, i] = orders[j - 1, i]
             j -= 1
         orders[j, 0], orders[j, 1], orders[j, 2] = what, keyframe, row
+    while first < plan[0].orders and orders[first, 0] != SUMMED:
+        first += 1
+    return first
+
+
+@inner
+def has_sum(
+    plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], first: int, begin_ns: int, end_ns: int
+) -> bool:
+    """Whether the readings to sum, from `first` on, know the displacement: no long silence, no axis unmeasured."""
+    before_ns = begin_ns
+    for k in range(first, plan[0].orders):
+        reading = rows[orders[k, 2]]
+        for i in range(3):
+            if not np.isfinite(reading.sigma[i]):
+                return False
+        if reading.t_ns - before_ns > plan[0].hold_ns:
+            return False
+        before_ns = reading.t_ns
+    return end_ns - before_ns <= plan[0].hold_ns
 
 
 @inner
 def place_one_by_one(
     plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], orders: NDArray[np.int64], first: int, end_ns: int
 ) -> None:
-    """Turn orders to sum, from `first` on, into readings by themselves: the DVL was silent for too long, or left an
-    axis unmeasured. The reading at the interval's end belongs to the next one.
-    """  # fmt: skip
+    """Turn orders to sum, from `first` on, into orders of single readings; one at the interval's end is the next's."""
     p, n = plan[0], plan[0].orders
     p.orders = first
     for k in range(first, n):

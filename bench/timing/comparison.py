@@ -56,7 +56,7 @@ class Effort:
 
 
 FULL, SHORT = Effort(5, 4), Effort(3, 3)
-"""Of a long and of a short benchmark."""
+"""Enough to find a slowdown of 20 % on a busy machine (`test_comparison`); the short one takes a minute or two."""
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,13 @@ import pandas as pd
 
 from ...drawing import looks_of, save
 from ...results.summary import Record, file_names, groups, records, summarise
+from ..estimates import tracks_of
 from .ablation import draw_ablation
 from .consistency import draw_nees
 from .cost import draw_costs, priced
 from .lag import draw_lag_curve, lag_curve
 from .step_time import draw_step_times, step_times
-from .track import Track, draw_errors, draw_tracks, load_trajectory, pages_of, tracks_of
-
-__all__ = ["Track", "draw_figures", "load_trajectory", "tracks_of"]
+from .track import draw_errors, draw_tracks, pages_of
 
 
 def draw_figures(rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = ()) -> list[Path]:

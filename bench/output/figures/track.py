@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ....datasets.state import Array
-from ....datasets.trajectory import Trajectory
 from ...drawing import (
     COLUMN_IN,
     TEXT_PT,
@@ -26,60 +22,15 @@ from ...drawing import (
     narrow,
     title_above,
 )
-from ...metrics import Alignment, ScoreError, align, associate
-from ...results.summary import Record
 from ..cells import DIRECTIONS, ONLINE, SMOOTHED, TIME
+from ..estimates import Track, error_m, has_bounds, is_near
 
 MARKS = 6
 """How many markers a track has."""
 MOST_ROWS = 6
 """More estimators than this do not fit one page of errors."""
-SMALLEST_EXTENT_M = 1.0
-"""Of a truth that hardly moves: otherwise every track would be far from it."""
-
 SMOOTHED_LINE: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": (0, (1, 1.2))}
 BOUND: dict[str, Any] = {"color": "black", "linewidth": 0.5, "linestyle": (0, (6, 2))}
-
-
-class Track(NamedTuple):
-    """One run's estimate beside the truth, associated and aligned, or alone where there is no truth."""
-
-    label: str
-    output: str
-    align: Alignment
-    truth: Trajectory | None
-    estimate: Trajectory
-
-
-def tracks_of(rows: Sequence[Record], folder: Path) -> tuple[list[Track], int | None]:
-    """Read the trajectories of a log's first seed that has any; return (tracks, seed)."""
-    saved = [row for row in rows if row["trajectory"] is not None and (folder / row["trajectory"]).is_file()]
-    if not saved:
-        return [], None
-    seed = min((row["seed"] for row in saved if row["seed"] is not None), default=None)
-    tracks = [_track(row, folder) for row in saved if row["seed"] == seed]
-    return [track for track in tracks if track is not None], seed
-
-
-def _track(row: Record, folder: Path) -> Track | None:
-    estimate = load_trajectory(folder / row["trajectory"])
-    truth = row["truth_trajectory"]
-    if truth is None or not (folder / truth).is_file():
-        return Track(row["label"], row["output"], "none", None, estimate)
-    try:
-        truth, estimate = associate(load_trajectory(folder / truth), estimate)
-        return Track(row["label"], row["output"], row["align"], truth, align(truth, estimate, row["align"]))
-    except ScoreError:  # it has no score either
-        return None
-
-
-def load_trajectory(path: Path) -> Trajectory:
-    """Read a saved trajectory; of its covariance the 3 × 3 blocks are kept, the rest is NaN."""
-    table = pd.read_parquet(path)
-    if "P_0_0" in table:
-        across = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15)]
-        table = table.reindex(columns=[*table.columns, *(name for name in across if name not in table)])
-    return Trajectory.from_pandas(table)
 
 
 def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> Figure:
@@ -180,25 +131,6 @@ def _draw_error(axes: Axes, track: Track, axis: int, colour: str) -> None:
     style = {"color": colour, "linewidth": 1.0} if online else SMOOTHED_LINE
     axes.plot(t_s, error_m(track)[:, axis], **style)
     axes.axhline(0, color="black", linewidth=0.4)
-
-
-def error_m(track: Track) -> Array:
-    """Return the position error (n, 3), m, of a track that has a truth."""
-    assert track.truth is not None
-    return track.estimate.p_WB_W - track.truth.p_WB_W
-
-
-def is_near(track: Track) -> bool:
-    """Whether a track keeps within the truth's own extent of it: one that got lost does not set a figure's scale."""
-    if track.truth is None:
-        return True
-    extent_m = np.ptp(track.truth.p_WB_W[:, :2], axis=0).max()
-    return bool(np.nanmax(np.abs(error_m(track)[:, :2]), initial=0.0) < max(extent_m, SMALLEST_EXTENT_M))
-
-
-def has_bounds(track: Track) -> bool:
-    """Whether the error has a σ in its own axes: there is a truth and a covariance, and nothing was aligned."""
-    return track.truth is not None and track.align == "none" and track.estimate.P is not None
 
 
 def _aligned(tracks: Sequence[Track]) -> str:

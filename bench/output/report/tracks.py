@@ -14,7 +14,7 @@ from pyarrow.parquet import read_metadata
 from ....datasets.errors import one_line
 from ....datasets.state import POSITION, Array
 from ...results.summary import Record, groups
-from ..figures.track import Track, error_m, has_bounds, is_near, tracks_of
+from ..estimates import Track, error_m, has_bounds, is_near, tracks_of
 from .curves import named
 
 POSES = 200_000

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from statistics import median
 from textwrap import shorten
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -114,8 +113,7 @@ def _several(names: Sequence[str]) -> str:
 
 
 def _empty(first: str, headings: Sequence[str]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
-    table.add_column(first, overflow="fold", min_width=14)
+    table = terminal.plain_table(first)
     for heading in headings:
         table.add_column(heading, overflow="fold", justify="left" if heading in ("output", "verdict") else "right")
     return table

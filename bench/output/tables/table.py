@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pandas as pd
-from rich import box
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
@@ -21,8 +20,6 @@ from ..cells import Cell
 from ..remarks import failures, mostly_outside, not_positive
 from . import terminal
 
-NAME_WIDTH = 14
-"""The names of estimators are not folded to less than this many letters: they would be hard to read."""
 ANY_WIDTH = 10_000
 """More letters than any table is wide; in less room rich gives the width after cutting."""
 
@@ -125,14 +122,6 @@ def _parts(cell: Cell, width: int) -> Iterator[str]:
 
 def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
     """Lay out some columns of a table, with the names before them, each name once."""
-    table = Table(
-        title=Text(sheet.title, "table.title"),
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        show_edge=False,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-    )
     headings = [sheet.headings[0], *(column[0] for column in columns)]
     tall = any("\n" in heading for heading in headings)
     shown, above = [], ""
@@ -140,7 +129,7 @@ def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
         top, below = heading.split("\n") if "\n" in heading else ("", heading)
         shown.append(f"{'' if top == above else top}\n{below}" if tall else below)
         above = top
-    table.add_column(shown[0], overflow="fold", min_width=NAME_WIDTH)
+    table = terminal.plain_table(shown[0], sheet.title)
     for heading, (_, *texts) in zip(shown[1:], columns, strict=True):
         width = max(map(cell_len, (*heading.split("\n"), *texts)))
         table.add_column(heading, justify="right", no_wrap=True, min_width=width)

@@ -14,11 +14,12 @@ from fathom.bench.execution.task import Task
 from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.scoring import SCORES
+from fathom.bench.output.estimates import load_trajectory, tracks_of
 from fathom.bench.output.figures.consistency import draw_nees
 from fathom.bench.output.figures.cost import draw_costs, priced
 from fathom.bench.output.figures.figures import draw_figures
 from fathom.bench.output.figures.step_time import draw_step_times
-from fathom.bench.output.figures.track import draw_errors, draw_tracks, load_trajectory, pages_of, tracks_of
+from fathom.bench.output.figures.track import draw_errors, draw_tracks, pages_of
 from fathom.bench.output.tables.table import print_table, write_consistency, write_table
 from fathom.bench.results.store import COLUMNS
 from fathom.bench.results.summary import records, summarise

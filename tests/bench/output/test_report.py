@@ -20,7 +20,7 @@ from fathom.bench.cli import app as cli
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.output import present as presenting
 from fathom.bench.output.cells import ACCURACY, spans
-from fathom.bench.output.figures.track import load_trajectory
+from fathom.bench.output.estimates import load_trajectory
 from fathom.bench.output.report.page import ordinal, render
 from fathom.bench.output.report.results import differences_of, in_order, kept_plan
 from fathom.bench.output.tables.table import print_table
