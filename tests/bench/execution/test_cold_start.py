@@ -70,6 +70,7 @@ def test_the_first_time_is_told_once_and_the_second_time_nothing_is_done(
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_two_cores_compile_for_two_estimators_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cold_start, "_cores", lambda: 2)
     monkeypatch.setenv("MEETING", "1")
@@ -79,6 +80,7 @@ def test_two_cores_compile_for_two_estimators_at_once(folder: Path, monkeypatch:
     assert set(asked(folder)) == {"WindowSmoother", "ErrorStateKalmanFilter"}
 
 
+@pytest.mark.slow
 def test_what_a_dead_process_left_undone_is_left_to_the_workers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cold_start, "_cores", lambda: 2)
     monkeypatch.setenv("DIES", "WindowSmoother")

@@ -106,6 +106,7 @@ def test_every_run_comes_out_identical_and_the_result_stays_as_it_was(result: Pa
     assert contents(result) == before
 
 
+@pytest.mark.slow
 def test_workers_give_the_bits_that_workers_gave(tmp_path: Path) -> None:
     plan = Experiment.from_dict(SHORT | {"seeds": [3]})
     run_experiment(plan, out=tmp_path, jobs=1)

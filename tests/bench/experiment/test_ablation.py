@@ -313,6 +313,7 @@ def differences(folder: Path) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for row in rows]
 
 
+@pytest.mark.slow
 def test_one_command_runs_compares_and_draws(folder: Path, differences: list[dict[str, Any]]) -> None:
     assert len(differences) == 2 * (2 + 2 + 3)  # drops on both logs, and three estimators across the logs
     by = {(row["log"], row["label"], row["baseline_log"], row["score"]): row for row in differences}
@@ -366,6 +367,7 @@ def test_the_figure_is_vectors_and_a_legible_png(differences: list[dict[str, Any
     assert "#ffffff" in faces
 
 
+@pytest.mark.slow
 def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = WorkerCache()
     monkeypatch.setattr(
@@ -380,6 +382,7 @@ def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.Monk
     assert len(pd.read_csv(folder / "paired.csv")) == 14  # and the file still has all
 
 
+@pytest.mark.slow
 def test_a_task_knows_its_variant(folder: Path) -> None:
     plan = Experiment.from_dict(PLAN)
     row = Task.of(plan, plan.runs()[1]).row("done", None)

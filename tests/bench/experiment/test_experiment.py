@@ -213,6 +213,7 @@ def test_an_unknown_experiment_is_answered_with_the_nearest() -> None:
         Experiment.load("x" * 300)
 
 
+@pytest.mark.slow
 def test_mishaps_are_rows_and_the_others_go_on(tmp_path: Path, mishap: None) -> None:
     kinds = ("dies", "diverges", "throws", "none")
     plan = experiment(
@@ -239,6 +240,7 @@ def test_mishaps_are_rows_and_the_others_go_on(tmp_path: Path, mishap: None) -> 
     assert summary["lawnmower-tactical", "throws"]["ate_rmse_m"] is None
 
 
+@pytest.mark.slow
 def test_a_worker_hung_in_one_call_is_killed(tmp_path: Path, mishap: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fathom.bench.execution.pool.GRACE_S", 15.0)
     warm_up(create("dead-reckoning"))  # or its worker compiles for longer than that
@@ -266,6 +268,7 @@ def test_a_row_says_where_its_numbers_come_from_and_running_again_replaces_it(tm
         assert (tmp_path / "t" / "trajectories" / name).stat().st_size < 100_000
 
 
+@pytest.mark.slow
 def test_only_runs_what_matches(tmp_path: Path) -> None:
     plan = experiment(estimators=[{"name": "dead-reckoning", "label": label} for label in ("a", "b", "bb")])
     assert run_experiment(plan, out=tmp_path, jobs=1, only="b*")["label"].tolist() == ["b", "bb"]
@@ -274,6 +277,7 @@ def test_only_runs_what_matches(tmp_path: Path) -> None:
         run_experiment(plan, out=tmp_path, only="c")
 
 
+@pytest.mark.slow
 def test_estimators_share_their_random_numbers(tmp_path: Path) -> None:
     twins = [{"name": "dead-reckoning", "label": label} for label in ("one", "two")]
     rows = run_experiment(experiment(estimators=twins, seeds=[1, 2]), out=tmp_path, jobs=2)
@@ -282,6 +286,7 @@ def test_estimators_share_their_random_numbers(tmp_path: Path) -> None:
     assert by_seed["one"].nunique() == 2
 
 
+@pytest.mark.slow
 def test_seeds_are_pooled_before_the_root(tmp_path: Path) -> None:
     rows = run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path, jobs=2)
     (summary,) = summarise(rows)

@@ -704,6 +704,7 @@ def with_noise(rig: Rig, **densities: float) -> Rig:
     return dataclasses.replace(rig, imu_noise=dataclasses.replace(rig.imu_noise, **densities))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "what",
     [
