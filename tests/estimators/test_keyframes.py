@@ -140,6 +140,21 @@ def test_an_unknown_kind_of_reading_is_an_error() -> None:
             keyframes().take(200 * MS, received((kind, 200)))
 
 
+@pytest.mark.parametrize("name", ["fls", "isam2", "batch", "window", "dead-reckoning"])
+def test_no_pass_takes_a_reading_of_unknown_kind_for_another(name: str) -> None:
+    log = simulate(Scenario(duration_s=20.0), seed=1)
+    assert log.prior is not None
+    run = create(name).begin(log.prior, log.rig)
+    for epoch in cut(log).epochs:
+        if len(epoch.readings):
+            break
+        run.step(epoch)
+    readings = epoch.readings.copy()
+    readings["kind"][0] = 5
+    with pytest.raises(ValueError, match="unknown kind 5"):
+        run.step(epoch._replace(readings=readings))
+
+
 # --- any readings, in any order --------------------------------------------------------------------------------------
 
 
