@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.log import Log
-from ....datasets.rig import EARTH_RATE_RADPS
+from ....datasets.rig import EARTH_RATE_RAD_S
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
 from ..findings.panels import AXIS_COLOURS, thinned
@@ -173,7 +173,7 @@ def _bias(log: Log, bias: Array, total_s: float) -> list[Finding]:
     noise = log.rig.imu_noise
     largest = float(np.abs(bias).max())
     chance = noise.gyro_density / np.sqrt(total_s)
-    if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RATE_RADPS:
+    if largest <= SIGMAS * np.hypot(noise.gyro_bias_sigma, chance) + EARTH_RATE_RAD_S:
         return []
     message = (
         "At rest the gyro reads ({:.4g}, {:.4g}, {:.4g}) rad/s".format(*bias)
