@@ -17,7 +17,7 @@ class Listing(StrEnum):
 
 
 def list_(what: Listing) -> None:
-    """List estimators with their options, logs, experiments, or scores."""
+    """List estimators, logs, experiments or scores."""
     for name, about in LISTS[what]().items():
         typer.echo(f"{name}: {about}" if about else name)
 

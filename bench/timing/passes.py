@@ -6,11 +6,11 @@ marks as no stage is the rest of a step, and the output of a belief.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from time import perf_counter_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +143,9 @@ def timed_run(log: Log, estimator: Estimator, stages: bool) -> Timed | Estimator
         return EstimatorError(f"{estimator}: {result.status}: {result.cause}")
     voyage = cut(log, score_ticks(log, 1.0), estimator.factors, 1.0)
     no_parts = [np.zeros((len(times), len(PARTS)), np.int64) for times in (result.step_ns, result.belief_ns)]
-    step_parts, belief_parts = (np.array(parts) for parts in watched.parts) if stages else no_parts
+    step_parts, belief_parts = no_parts
+    if stages:
+        step_parts, belief_parts = parts_of(watched.steps, "rest"), parts_of(watched.beliefs, "output")
     return Timed(
         np.array([epoch.t_ns for epoch in voyage.epochs]) - voyage.start_ns,
         result.step_ns,
@@ -157,16 +159,25 @@ def timed_run(log: Log, estimator: Estimator, stages: bool) -> Timed | Estimator
     )
 
 
+class Call(NamedTuple):
+    """One call: the clock of stages before it, its whole time, and the clock after it, ns."""
+
+    before: tuple[int, ...]
+    elapsed_ns: int
+    after: tuple[int, ...]
+
+
 @dataclass(frozen=True)
 class Watched:
     """An estimator whose pass is timed stage by stage.
 
     Attributes:
-        parts: time of each step, and of each belief, by PARTS, ns.
+        steps, beliefs: the calls of its pass.
     """
 
     estimator: Estimator
-    parts: tuple[list[Parts], list[Parts]] = field(default_factory=lambda: ([], []))
+    steps: list[Call] = field(default_factory=list)
+    beliefs: list[Call] = field(default_factory=list)
 
     @property
     def factors(self) -> frozenset[str]:
@@ -175,14 +186,14 @@ class Watched:
 
     def begin(self, prior: Belief, rig: Rig) -> WatchedPass:
         """See `Estimator.begin`."""
-        return WatchedPass(self.estimator.begin(prior, rig), *self.parts)
+        return WatchedPass(self.estimator.begin(prior, rig), self.steps, self.beliefs)
 
 
 class WatchedPass:
-    """A pass whose steps and beliefs are timed stage by stage."""
+    """A pass whose steps and beliefs are timed stage by stage. It only notes times, for its own time is in a step's."""
 
-    def __init__(self, inner: Pass, step_parts: list[Parts], belief_parts: list[Parts]) -> None:
-        self._inner, self._step_parts, self._belief_parts = inner, step_parts, belief_parts
+    def __init__(self, inner: Pass, steps: list[Call], beliefs: list[Call]) -> None:
+        self._inner, self._steps, self._beliefs = inner, steps, beliefs
 
     @property
     def counts(self) -> dict[str, int]:
@@ -191,13 +202,15 @@ class WatchedPass:
 
     def step(self, epoch: Epoch) -> None:
         """See `Pass.step`."""
-        _, parts = _timed(lambda: self._inner.step(epoch), "rest")
-        self._step_parts.append(parts)
+        before, started = clock.read(), perf_counter_ns()
+        self._inner.step(epoch)
+        self._steps.append(Call(before, perf_counter_ns() - started, clock.read()))
 
     def belief(self) -> Belief:
         """See `Pass.belief`."""
-        belief, parts = _timed(self._inner.belief, "output")
-        self._belief_parts.append(parts)
+        before, started = clock.read(), perf_counter_ns()
+        belief = self._inner.belief()
+        self._beliefs.append(Call(before, perf_counter_ns() - started, clock.read()))
         return belief
 
     def finish(self) -> Trajectory | None:
@@ -205,12 +218,10 @@ class WatchedPass:
         return self._inner.finish()
 
 
-def _timed(call: Callable[[], Any], unmarked: str) -> tuple[Any, Parts]:
-    """Return what a call returns, and its time by PARTS, ns; what no stage has belongs to `unmarked`."""
-    before, started = clock.read(), perf_counter_ns()
-    answer = call()
-    elapsed_ns, after = perf_counter_ns() - started, clock.read()
-    parts = np.zeros(len(PARTS), np.int64)
-    parts[: len(STAGES)] = np.subtract(after, before)
-    parts[PARTS.index(unmarked)] += elapsed_ns - parts.sum()
-    return answer, parts
+def parts_of(calls: Sequence[Call], unmarked: str) -> Parts:
+    """Return the time of each call by PARTS, (calls, 6) ns; what no stage has belongs to the part `unmarked`."""
+    parts = np.zeros((len(calls), len(PARTS)), np.int64)
+    for row, call in zip(parts, calls, strict=True):
+        row[: len(STAGES)] = np.subtract(call.after, call.before)
+        row[PARTS.index(unmarked)] += call.elapsed_ns - row.sum()
+    return parts
