@@ -4,6 +4,7 @@ import pytest
 from fathom.bench.timing.compiling import compile_cpu_seconds
 
 
+@pytest.mark.slow
 def test_compiling_is_counted_from_an_empty_cache() -> None:
     found = compile_cpu_seconds(["dead-reckoning"])
     assert [times for name, _, times in found.by_function if name.endswith("preintegrate_dvl")] == [1]
