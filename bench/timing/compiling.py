@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import process_time
@@ -51,7 +51,7 @@ def measure(connection: Any, *names: str) -> None:
     from ...estimators.registry import create
     from ..execution.drive import warm_up
 
-    own_s: Counter[str] = Counter()
+    own_s: defaultdict[str, float] = defaultdict(float)
     times: Counter[str] = Counter()
     running: list[list[float]] = []  # of each function that is being compiled: its start, and the time of its callees
 
@@ -72,7 +72,9 @@ def measure(connection: Any, *names: str) -> None:
     event.register("numba:compile", Clock())
     for name in names:
         warm_up(create(name))
-    by_function = tuple((name, seconds, times[name]) for name, seconds in own_s.most_common())
+    by_function = tuple(
+        (name, seconds, times[name]) for name, seconds in sorted(own_s.items(), key=lambda each: -each[1])
+    )
     connection.send(Compiling(sum(own_s.values()), sum(times.values()), by_function))
 
 

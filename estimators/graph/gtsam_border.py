@@ -41,7 +41,8 @@ from ..physics.so3 import (
 from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, THETA_0, VELOCITY_0, local
 from ..stages import stage
 
-OF_PLACE, OF_GYRO = np.int64(3), np.int64(3)
+OF_PLACE: Any = np.int64(3)
+OF_GYRO: Any = np.int64(3)
 """Where the translation begins in GTSAM's pose tangent, and the gyro in its bias."""
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ...datasets.state import Array
 from .compiled import compiled
 
-TOP = np.int64(0)
+TOP: Any = np.int64(0)
 """The first row; a plain 0 would be a type of its own, and the function compiled once more."""
 
 

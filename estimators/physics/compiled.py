@@ -16,13 +16,13 @@ def compiled(function: F) -> F:
     A division by zero gives infinity or NaN, as in NumPy, instead of raising: that saves a branch at every division. No
     wrapper for calls from C is made; nobody calls from there.
     """
-    return cast(F, njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function))
+    return cast(Any, njit)(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)
 
 
 def inner(function: F) -> F:
     """Return the function, compiled as by `compiled`, to be called from compiled code only.
 
-    Without the wrapper that Python calls by, it compiles a quarter of a second faster. From Python its `py_func` does
+    Without the wrapper that Python calls by, it compiles faster. From Python its `py_func` does
     the same.
     """
-    return cast(F, njit(cache=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)(function))
+    return cast(Any, njit)(cache=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)(function)

@@ -30,9 +30,8 @@ from ...datasets.state import (
 from .compiled import compiled, inner
 from .so3 import between_into, exp_into, log_into, product_into, right_jacobian_into
 
-THETA_0, POSITION_0, VELOCITY_0, ACCEL_BIAS_0, GYRO_BIAS_0 = (
-    np.int64(part.start) for part in (THETA, POSITION, VELOCITY, ACCEL_BIAS, GYRO_BIAS)
-)
+FIRST: list[Any] = [np.int64(part.start) for part in (THETA, POSITION, VELOCITY, ACCEL_BIAS, GYRO_BIAS)]
+THETA_0, POSITION_0, VELOCITY_0, ACCEL_BIAS_0, GYRO_BIAS_0 = FIRST
 """Index of each part's first component in the error state, for loops: component i of the position's error is
 `error[POSITION_0 + i]`. To numba a Python integer is a type of its own, and a function compiled once for each."""
 
