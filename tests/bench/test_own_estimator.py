@@ -90,6 +90,7 @@ def test_the_estimator_on_the_page_is_at_most_fifty_lines() -> None:
     assert max(map(len, lines)) <= 120
 
 
+@pytest.mark.slow
 def test_the_installed_package_joins_by_its_entry_point_with_its_options(reader: Reader) -> None:
     listed = reader.fathom("list", "estimators").splitlines()
     assert "complementary: level_s, heading_s, drift, sigma_deg, factors" in listed

@@ -128,6 +128,7 @@ def test_a_log_yaml_alone_gives_back_the_readings(original, folder):
     assert "dvl: 15 rows invalid dropped" in log.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), [("eskf", {}), ("fls", {"lag_s": 3.0}), ("dead-reckoning", {})])
 def test_the_strangers_log_scores_as_the_original_does(original, folder, name, options):
     """Sigmas and densities are the data sheet's round figures, as in the tutorial; all else is the original's."""

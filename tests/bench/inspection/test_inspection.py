@@ -60,6 +60,7 @@ def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str)
 # a clean log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(
     "keys",
@@ -759,6 +760,7 @@ def call(*arguments: object) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
+@pytest.mark.slow
 def test_the_command_prints_facts_findings_and_where_the_figure_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -774,6 +776,7 @@ def test_the_command_prints_facts_findings_and_where_the_figure_is(
     assert (tmp_path / "inspect-lawnmower-tactical-s3.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_figure_goes_where_it_is_told(tmp_path: Path) -> None:
     write_folder(simulated(), tmp_path / "log")
     code, out, _ = call(tmp_path / "log", "-o", tmp_path / "new" / "page.pdf")

@@ -113,6 +113,7 @@ def test_hindsight_at_a_lag_claims_what_the_floor_of_just_that_lag_allows(lag_s:
     assert np.sqrt(ratio).mean(axis=0) == pytest.approx(np.ones(6), abs=4e-3)
 
 
+@pytest.mark.slow
 def test_the_lag_curve_and_the_floors_table_are_shown(rows: pd.DataFrame, folder: Path) -> None:
     files = {path.name for path in draw_figures(rows, folder)}
     assert {"lawnmower-tactical-lag.pdf", "lawnmower-tactical-lag.png"} <= files
@@ -126,6 +127,7 @@ def test_the_lag_curve_and_the_floors_table_are_shown(rows: pd.DataFrame, folder
     assert max(map(len, text.splitlines())) <= 120
 
 
+@pytest.mark.slow
 def test_two_lags_are_no_curve(rows: pd.DataFrame, folder: Path) -> None:
     files = {path.name for path in draw_figures(rows[~rows["label"].isin(["fls 4"])], folder)}
     assert "lawnmower-tactical-lag.png" not in files

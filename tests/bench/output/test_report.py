@@ -29,6 +29,8 @@ from fathom.bench.results.store import load_runs
 from rich.console import Console
 from typer.testing import CliRunner
 
+pytestmark = pytest.mark.slow  # every test reads the page of a whole experiment, most of them in a browser
+
 EXPERIMENT = """
 description: "Does hindsight pay? <b>Not bold</b> & short."
 logs: [{scenario: {duration_s: 40}}]

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import pytest
 from fathom.bench.timing.compiling import compile_cpu_seconds
 
 
+@pytest.mark.slow
 def test_compiling_is_counted_from_an_empty_cache() -> None:
     found = compile_cpu_seconds(["dead-reckoning"])
     again = compile_cpu_seconds(["dead-reckoning"])

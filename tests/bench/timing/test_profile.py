@@ -208,6 +208,7 @@ def test_the_table_of_the_fleet_fits_a_page_and_every_estimator_has_a_bar(profil
     assert [label.get_text() for label in axes.get_yticklabels()] == list(ESTIMATORS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "absent"),
     [
