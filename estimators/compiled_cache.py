@@ -27,7 +27,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 import platformdirs
-from numba.core import caching
+from numba.core import caching, config
 
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = 20
@@ -45,9 +45,13 @@ def sources() -> tuple[Path, ...]:
 
 
 def code_of(source: str) -> str:
-    """Return what a source says once comments, docstrings and places in the file are left out."""
+    """Return what a source says once comments, docstrings, types of functions and places in the file are left out."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
+        if isinstance(node, ast.arg):
+            node.annotation = None
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            node.returns = None
         body = getattr(node, "body", None)
         if isinstance(body, list):
             node.body = [line for line in body if not _is_text(line)]  # pyright: ignore[reportAttributeAccessIssue]
@@ -81,7 +85,7 @@ def key_of(texts: Iterable[tuple[str, str]], notes: Path) -> str:
 def _flags() -> list[str]:
     """Return numba's settings that decide the machine code."""
     names = ("OPT", "DISABLE_JIT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "CPU_NAME", "CPU_FEATURES", "BOUNDSCHECK")
-    return [f"{name}={getattr(numba.config, name, None)}" for name in names]
+    return [f"{name}={getattr(config, name, None)}" for name in names]
 
 
 def base_folder() -> Path:
@@ -150,15 +154,15 @@ class Locator(caching._CacheLocator):
         ours = path.is_file() and any(path.is_relative_to(ROOT / name) for name in ("bench", "datasets", "estimators"))
         return cls(py_func, py_file) if ours else None
 
-    def get_cache_path(self) -> str:
+    def get_cache_path(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """See numba's `_CacheLocator`."""
         return str(compiled_folder() / self._path.relative_to(ROOT).parent.as_posix().replace("/", "."))
 
-    def get_source_stamp(self) -> str:
+    def get_source_stamp(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return what else than the folder's name decides the code: of a function beside the estimators, its file."""
         return "" if self._path in sources() else sha256(code_of(self._path.read_text("utf-8")).encode()).hexdigest()
 
-    def get_disambiguator(self) -> str:
+    def get_disambiguator(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """See numba's `_CacheLocator`; no line number, for that moves with every comment."""
         return "code"
 
@@ -166,4 +170,4 @@ class Locator(caching._CacheLocator):
 def use_compiled_folder() -> None:
     """Have numba keep our functions' code in `compiled_folder`; to be called before anything is compiled or loaded."""
     defaults = [kind.__name__ for kind in caching.CacheImpl._locator_classes]
-    numba.config.CACHE_LOCATOR_CLASSES = ",".join([f"{__name__}.{Locator.__name__}", *defaults])
+    config.CACHE_LOCATOR_CLASSES = ",".join([f"{__name__}.{Locator.__name__}", *defaults])  # pyright: ignore[reportAttributeAccessIssue]

@@ -84,7 +84,10 @@ class Pass(Protocol):
 class Estimator(Protocol):
     """A frozen configuration; `factors` are the sensors it may use."""
 
-    factors: frozenset[str]
+    @property
+    def factors(self) -> frozenset[str]:
+        """The sensors it may use."""
+        ...
 
     def begin(self, prior: Belief, rig: Rig) -> Pass:
         """Return a new pass that starts from the prior, on a vehicle with this rig."""

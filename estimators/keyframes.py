@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..datasets.epochs import DVL, READING, SENSOR
 from ..datasets.state import TimeArray
 from .interface import unknown_kind
-from .physics.compiled import compiled, inner
+from .physics.compiled import Records, compiled, inner
 from .smoothers import GraphSmoother
 
 LONGEST_SILENCE_S = 1.0
@@ -111,7 +111,7 @@ class Keyframes:
         self._orders = np.zeros((64, 3), np.int64)
         self.rows = np.zeros(16, READING)
 
-    def take(self, now_ns: int, readings: NDArray[Any]) -> NDArray[np.int64]:
+    def take(self, now_ns: int, readings: Records) -> NDArray[np.int64]:
         """Return what to do with the READING rows received at now_ns: the orders, (n, 3), valid until the next call.
 
         Raises:
@@ -123,7 +123,7 @@ class Keyframes:
         """Return the last orders: a keyframe at the end, and all that still waits given to it."""
         return self._decide(int(self._plan["now_ns"][0]), NO_READINGS, True)
 
-    def not_given_out(self) -> list[NDArray[Any]]:
+    def not_given_out(self) -> list[Records]:
         """Return the readings that no keyframe has taken yet, in the order of their times, READING rows."""
         waits = np.flatnonzero(self._roles[: int(self._plan["rows"][0])] == WAITS)
         return [self.rows[k : k + 1] for k in waits[np.argsort(self.rows["t_ns"][waits], kind="stable")].tolist()]
@@ -134,7 +134,7 @@ class Keyframes:
         counts = {name: int(self._plan[name][0]) for name in COUNTS}
         return Counter({"keyframes": int(self._plan["newest"][0]) + 1, **counts})
 
-    def _decide(self, now_ns: int, readings: NDArray[Any], closing: bool) -> NDArray[np.int64]:
+    def _decide(self, now_ns: int, readings: Records, closing: bool) -> NDArray[np.int64]:
         while True:
             n = decide(self._plan, self._times, self.rows, self._roles, self._orders, readings, now_ns, closing)
             if n >= 0:
@@ -156,8 +156,8 @@ class Keyframes:
 
 @compiled
 def decide(
-    plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], roles: NDArray[np.int64], orders: NDArray[np.int64],
-    readings: NDArray[Any], now_ns: int, closing: bool,
+    plan: Records, times: TimeArray, rows: Records, roles: NDArray[np.int64], orders: NDArray[np.int64],
+    readings: Records, now_ns: int, closing: bool,
 ) -> int:  # fmt: skip
     """Write down what to do with the readings of an epoch, or at the end of a log; return how many orders there are.
 
@@ -198,7 +198,7 @@ def decide(
 
 
 @inner
-def order(plan: NDArray[Any], orders: NDArray[np.int64], what: int, keyframe: int, x: int) -> None:
+def order(plan: Records, orders: NDArray[np.int64], what: Any, keyframe: Any, x: Any) -> None:
     """Write an order down."""
     n = plan[0].orders
     orders[n, 0], orders[n, 1], orders[n, 2] = what, keyframe, x
@@ -206,7 +206,7 @@ def order(plan: NDArray[Any], orders: NDArray[np.int64], what: int, keyframe: in
 
 
 @inner
-def throw_away(plan: NDArray[Any], rows: NDArray[Any], roles: NDArray[np.int64]) -> None:
+def throw_away(plan: Records, rows: Records, roles: NDArray[np.int64]) -> None:
     """Drop the rows that are not needed any more; the others keep their order."""
     kept = 0
     for row in range(plan[0].rows):
@@ -219,8 +219,8 @@ def throw_away(plan: NDArray[Any], rows: NDArray[Any], roles: NDArray[np.int64])
 
 @inner
 def receive(
-    plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], roles: NDArray[np.int64], orders: NDArray[np.int64],
-    readings: NDArray[Any],
+    plan: Records, times: TimeArray, rows: Records, roles: NDArray[np.int64], orders: NDArray[np.int64],
+    readings: Records,
 ) -> None:  # fmt: skip
     """Keep the readings of an epoch in the order of their times, but for those of no use; give late ones out."""
     p, first = plan[0], plan[0].rows
@@ -253,9 +253,7 @@ def receive(
 
 
 @inner
-def place(
-    plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], orders: NDArray[np.int64], k: int, row: int
-) -> None:
+def place(plan: Records, times: TimeArray, rows: Records, orders: NDArray[np.int64], k: int, row: int) -> None:
     """Order a reading on keyframe k, as of it or carried there."""
     p, off_ns = plan[0], rows[row].t_ns - times[k & (len(times) - 1)]
     if abs(off_ns) > p.merge_ns:
@@ -267,7 +265,7 @@ def place(
 
 
 @inner
-def makes_keyframe(now_ns: int, plan: NDArray[Any], times: TimeArray, kind: int, t_ns: int) -> bool:
+def makes_keyframe(now_ns: int, plan: Records, times: TimeArray, kind: int, t_ns: int) -> bool:
     """Whether a reading that has just come makes a keyframe."""
     p = plan[0]
     since_ns = t_ns - times[p.newest & (len(times) - 1)]
@@ -281,7 +279,7 @@ def makes_keyframe(now_ns: int, plan: NDArray[Any], times: TimeArray, kind: int,
 
 @inner
 def close(
-    plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], roles: NDArray[np.int64], orders: NDArray[np.int64],
+    plan: Records, times: TimeArray, rows: Records, roles: NDArray[np.int64], orders: NDArray[np.int64],
     t_ns: int,
 ) -> None:  # fmt: skip
     """Order a keyframe at t_ns, give out the readings that waited for it, and say which keyframes leave."""
@@ -315,7 +313,7 @@ def close(
 
 
 @inner
-def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], first: int) -> int:
+def sort_sum(plan: Records, rows: Records, orders: NDArray[np.int64], first: int) -> int:
     """Bring the readings to sum behind the others, in the order of their times; return where they begin."""
     for k in range(first + 1, plan[0].orders):
         what, keyframe, row = orders[k, 0], orders[k, 1], orders[k, 2]
@@ -335,9 +333,7 @@ def sort_sum(plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], 
 
 
 @inner
-def has_sum(
-    plan: NDArray[Any], rows: NDArray[Any], orders: NDArray[np.int64], first: int, begin_ns: int, end_ns: int
-) -> bool:
+def has_sum(plan: Records, rows: Records, orders: NDArray[np.int64], first: int, begin_ns: Any, end_ns: int) -> bool:
     """Whether the readings to sum, from `first` on, know the displacement: no long silence, no axis unmeasured."""
     before_ns = begin_ns
     for k in range(first, plan[0].orders):
@@ -353,7 +349,7 @@ def has_sum(
 
 @inner
 def place_one_by_one(
-    plan: NDArray[Any], times: TimeArray, rows: NDArray[Any], orders: NDArray[np.int64], first: int, end_ns: int
+    plan: Records, times: TimeArray, rows: Records, orders: NDArray[np.int64], first: int, end_ns: int
 ) -> None:
     """Turn orders to sum, from `first` on, into orders of single readings; one at the interval's end is the next's."""
     p, n = plan[0], plan[0].orders

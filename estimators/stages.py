@@ -30,13 +30,14 @@ class StageClock:
     def __init__(self) -> None:
         self.running = False
         self.calls: Counter[str] = Counter()
-        self._ns = dict.fromkeys(STAGES, 0)
+        self._ns: dict[str, int] = dict.fromkeys(STAGES, 0)
         self._entered: list[str] = []
         self._since_ns = 0
 
     def start(self) -> None:
         """Set every stage to 0, and time from now on. Passes that are timed begin after this."""
-        self._ns, self._entered, self.running = dict.fromkeys(STAGES, 0), [], True
+        self._ns = dict[str, int](dict.fromkeys(STAGES, 0))
+        self._entered, self.running = [], True
         self.calls.clear()
 
     def stop(self) -> None:

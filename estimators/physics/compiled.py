@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, TypeAlias, TypeVar, cast
 
 from numba import njit
+
+Records: TypeAlias = Any
+"""An array of records; NumPy's types know nothing of their fields."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -12,14 +12,13 @@ flat, and a function takes the arrays that it needs, not all there are.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.state import DIM
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME
-from ..physics.compiled import compiled, inner
+from ..physics.compiled import Records, compiled, inner
 from ..physics.elimination import absorb_row, divide_into
 from ..physics.imu import integrate, predict
 from ..physics.state import STATE, retract
@@ -71,8 +70,8 @@ WINDOW = np.dtype(
 
 @compiled
 def extend(
-    w: NDArray[Any], nodes: NDArray[Any], points: NDArray[Any], blocks: NDArray[Any], factors: NDArray[Any],
-    readings: NDArray[Any], carries: NDArray[Any], imu: NDArray[Any], rig: NDArray[Any], rows: NDArray[Any],
+    w: Records, nodes: Records, points: Records, blocks: Records, factors: Records,
+    readings: Records, carries: Records, imu: Records, rig: Records, rows: Records,
     orders: NDArray[np.int64], first: int,
 ) -> int:  # fmt: skip
     """Follow orders from the first on, up to one to sum or to solve; return its place, how many there are, or NO_ROOM.
@@ -108,8 +107,8 @@ def extend(
 
 @inner
 def make_keyframe(
-    w: NDArray[Any], nodes: NDArray[Any], points: NDArray[Any], blocks: NDArray[Any], imu: NDArray[Any],
-    rig: NDArray[Any], t_ns: int,
+    w: Records, nodes: Records, points: Records, blocks: Records, imu: Records,
+    rig: Records, t_ns: int,
 ) -> None:  # fmt: skip
     """Close the newest keyframe's interval at t_ns, and predict a keyframe there by the IMU."""
     v, mask = w[0], len(nodes) - 1
@@ -129,7 +128,7 @@ def make_keyframe(
 
 
 @inner
-def end_of(w: NDArray[Any], imu: NDArray[Any], first: int, t_ns: int) -> int:
+def end_of(w: Records, imu: Records, first: int, t_ns: int) -> int:
     """Return the place of the first sample, from `first` on, that ends after t_ns."""
     while first < w[0].n_imu and imu[first].t_ns <= t_ns:
         first += 1
@@ -137,7 +136,7 @@ def end_of(w: NDArray[Any], imu: NDArray[Any], first: int, t_ns: int) -> int:
 
 
 @inner
-def split_samples(w: NDArray[Any], imu: NDArray[Any], first: int, t_ns: int) -> None:
+def split_samples(w: Records, imu: Records, first: int, t_ns: int) -> None:
     """Split the sample that straddles t_ns, if one does, into two of the same rates."""
     k = end_of(w, imu, first, t_ns)
     if k < w[0].n_imu:
@@ -152,8 +151,8 @@ def split_samples(w: NDArray[Any], imu: NDArray[Any], first: int, t_ns: int) -> 
 
 @inner
 def move_along(
-    w: NDArray[Any], nodes: NDArray[Any], points: NDArray[Any], imu: NDArray[Any], rig: NDArray[Any], k: int,
-    t_ns: int, block: NDArray[Any],
+    w: Records, nodes: Records, points: Records, imu: Records, rig: Records, k: int,
+    t_ns: int, block: Records,
 ) -> None:  # fmt: skip
     """Integrate the motion from keyframe k to t_ns into a BLOCK, at the biases of keyframe k as they are now."""
     v, a = w[0], k & (len(nodes) - 1)
@@ -172,7 +171,7 @@ def move_along(
 
 
 @compiled
-def add_factor(w: NDArray[Any], nodes: NDArray[Any], factors: NDArray[Any], k: int, kind: int, form: int) -> int:
+def add_factor(w: Records, nodes: Records, factors: Records, k: int, kind: int, form: int) -> int:
     """Return a free row, as a factor on keyframe k."""
     v, node = w[0], nodes[k & (len(nodes) - 1)]
     f = v.free
@@ -191,9 +190,9 @@ def add_factor(w: NDArray[Any], nodes: NDArray[Any], factors: NDArray[Any], k: i
 
 @compiled
 def linearise(
-    w: NDArray[Any], nodes: NDArray[Any], points: NDArray[Any], blocks: NDArray[Any], factors: NDArray[Any],
-    readings: NDArray[Any], carries: NDArray[Any], displacements: NDArray[Any], anchor: NDArray[Any],
-    rig: NDArray[Any], exact: bool,
+    w: Records, nodes: Records, points: Records, blocks: Records, factors: Records,
+    readings: Records, carries: Records, displacements: Records, anchor: Records,
+    rig: Records, exact: bool,
 ) -> int:  # fmt: skip
     """Linearise what is new, and anew the keyframes that have moved beyond the thresholds, or, `exact`, at all.
 
@@ -238,7 +237,7 @@ def linearise(
 
 
 @inner
-def has_moved(w: NDArray[Any], nodes: NDArray[Any], a: int, exact: bool) -> bool:
+def has_moved(w: Records, nodes: Records, a: int, exact: bool) -> bool:
     """Whether the increment in place a is beyond the thresholds, or, `exact`, more than rounding."""
     node = nodes[a]
     for i in range(DIM):
@@ -250,7 +249,7 @@ def has_moved(w: NDArray[Any], nodes: NDArray[Any], a: int, exact: bool) -> bool
 
 @compiled
 def solve(
-    w: NDArray[Any], nodes: NDArray[Any], points: NDArray[Any], factors: NDArray[Any], first: int, reach: int
+    w: Records, nodes: Records, points: Records, factors: Records, first: int, reach: int
 ) -> int:  # fmt: skip
     """Factor anew from keyframe `first` on, and find the increments of it and of `reach` keyframes at least.
 
@@ -298,7 +297,7 @@ def solve(
 
 @compiled
 def forget(
-    w: NDArray[Any], nodes: NDArray[Any], points: NDArray[Any], factors: NDArray[Any], anchor: NDArray[Any],
+    w: Records, nodes: Records, points: Records, factors: Records, anchor: Records,
     oldest: int,
 ) -> None:  # fmt: skip
     """Marginalise the keyframes before `oldest` out; what they said of it becomes its prior, at the anchor."""
@@ -321,7 +320,7 @@ def forget(
 
 
 @compiled
-def count_outliers(w: NDArray[Any], nodes: NDArray[Any], factors: NDArray[Any], until: int) -> None:
+def count_outliers(w: Records, nodes: Records, factors: Records, until: int) -> None:
     """Count the factors on the keyframes before `until` that end beyond the width of their loss."""
     v, mask = w[0], len(nodes) - 1
     for k in range(v.oldest, until):

@@ -98,6 +98,7 @@ def test_where_no_folder_can_be_written_a_temporary_one_is_used_and_said(tmp_pat
         (('"""Doc."""', '"""Other."""'), True),
         (("def f", "\n\ndef f"), True),
         (("'label'", "'other'"), False),
+        (("def f(x):", "def f(x: int) -> int:"), True),
     ],
 )
 def test_code_is_what_is_left_without_comments_and_docstrings(change: tuple[str, str], same: bool) -> None:
