@@ -42,8 +42,9 @@ from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, THETA_
 from ..stages import stage
 
 OF_PLACE: Any = np.int64(3)
+"""Where the translation begins in GTSAM's pose tangent: (rotation, translation)."""
 OF_GYRO: Any = np.int64(3)
-"""Where the translation begins in GTSAM's pose tangent, and the gyro in its bias."""
+"""Where the gyro begins in GTSAM's bias: (accelerometer, gyro)."""
 NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
 """For factors that do not depend on velocity or bias."""

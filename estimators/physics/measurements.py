@@ -212,6 +212,9 @@ def measure(
 
     Returns:
         n, how many rows there are; 0 for a sensor that is switched off.
+
+    Raises:
+        ValueError: the reading is of no kind that there is.
     """
     reading, s, g = readings[m], state[0], rig[0]
     kind, R_WB, z = reading.kind, s.R_WB[:], reading.z[:]
@@ -229,7 +232,7 @@ def measure(
     elif kind == ATTITUDE:
         attitude_residual(R_WB, g.R_BH[:], z, r, H)
     else:
-        width = 0
+        raise ValueError("a reading of an unknown kind")
     n = 0  # rows that are measured; row i becomes row n
     for i in range(width):
         spread = reading.sigma[i] * g.inflate[kind]

@@ -14,13 +14,13 @@ import pytest
 from fathom.bench.cli.app import app
 from fathom.bench.execution import reproduce
 from fathom.bench.execution import sweep as runner
+from fathom.bench.execution import task as task_module
 from fathom.bench.execution.reproduce import compare, rebuild, reproduce_all
 from fathom.bench.execution.sweep import run_experiment
 from fathom.bench.execution.task import Finished, Task
 from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.floor import floors
-from fathom.bench.results import identity as ledger
 from fathom.bench.results import machine
 from fathom.bench.results.select import choose
 from fathom.datasets.described.folder import write_folder
@@ -183,7 +183,7 @@ def test_a_spec_that_is_not_the_rows_own_is_said(result: Path) -> None:
 def test_another_version_of_a_package_that_brings_the_estimator_is_said(
     result: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (ledger, reproduce):
+    for module in (task_module, reproduce):
         monkeypatch.setattr(module, "package_of", lambda name: "navkit 2.0")
     out = call("reproduce", result, "short dive/dead-reckoning/3")[1]
     assert "the version of navkit, now navkit 2.0, cannot be what it was made from" in out
@@ -322,7 +322,7 @@ def test_an_interruption_shows_what_is_known(result: Path, monkeypatch: pytest.M
     code, out, err = call("reproduce", result)
     assert code == 130
     assert "2 of 2 runs came out identical" in out
-    assert "interrupted: 2 of 6 runs" in err
+    assert "interrupted after 2 of 6 runs" in err
 
 
 def test_a_rebuilt_task_has_the_spec_and_identity_of_its_row(made: Path) -> None:
