@@ -281,7 +281,7 @@ for _ in range(kills):
 @pytest.mark.slow
 def test_killed_at_a_hundred_moments_no_run_is_lost_none_doubled_and_the_table_is_the_same(tmp_path: Path) -> None:
     estimators = [{"name": name, "label": f"{name} {k}"} for k in range(3) for name in ("eskf", "dead-reckoning")]
-    content: dict[str, Any] = {"name": "t", "logs": [SHORT], "estimators": estimators, "seeds": 60}
+    content: dict[str, Any] = {"name": "t", "logs": [SHORT], "estimators": estimators, "seeds": 180}
     (tmp_path / "killed.py").write_text(KILLED)
     command = [sys.executable, str(tmp_path / "killed.py"), json.dumps(content), str(tmp_path / "out"), "100"]
     printed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=900).stdout
@@ -300,7 +300,7 @@ def test_killed_at_a_hundred_moments_no_run_is_lost_none_doubled_and_the_table_i
     plan = Experiment.from_dict(content, "t.yaml")
     ended = run_experiment(plan, out=tmp_path / "out", jobs=2)
     undisturbed = run_experiment(plan, out=tmp_path / "whole", jobs=2)
-    assert len(load_runs(tmp_path / "out" / "t")) == len(ended) == 360
+    assert len(load_runs(tmp_path / "out" / "t")) == len(ended) == 6 * 180
     for rows, name in ((ended, "a.csv"), (undisturbed, "b.csv")):
         timed = [c for c in rows if c in {"started", "finished", "peak_mb", *runner_costs()}]
         write_table(rows.drop(columns=timed).reindex(columns=rows.columns), tmp_path / name)
