@@ -242,14 +242,14 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
 
 
 def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | None, int, Ending]:
-    """Return (hindsight, time it took, ending); a run that had ended early keeps its own cause."""
+    """Return (smoothed trajectory, time it took, ending); a run that had ended early keeps its own cause."""
     started = perf_counter_ns()
     smoothed = None
     try:
         smoothed = run.finish()
         if smoothed is not None and not (np.abs(smoothed.p_WB_W).max(initial=0.0) < LOST_M):  # nor NaN
             smoothed = None
-            raise Diverged("the state with hindsight is not finite, or off this planet")
+            raise Diverged("the smoothed state is not finite, or off this planet")
     except Exception as error:
         if ending.status == "done":
             lost = isinstance(error, Diverged)

@@ -158,7 +158,7 @@ class FilterPass:
         return with_rate_noise(Belief(self._t_ns, state, self._kalman.error_covariance(self._state)), self._rig)
 
     def finish(self) -> Trajectory | None:
-        """A filter has no hindsight."""
+        """Return None: a filter does not smooth."""
         return None
 
     def _live(self, epoch: Epoch) -> None:

@@ -280,7 +280,7 @@ class GraphPass:
             while self._ticks and self._ticks[0] < until_ns:
                 t_ns = self._ticks.popleft()
                 if t_ns >= self._covariance_due_ns:
-                    self._covariance_due_ns = t_ns + int(self._config.hindsight_covariance_s * 1e9)
+                    self._covariance_due_ns = t_ns + int(self._config.smoothed_covariance_s * 1e9)
                     belief = self._solver.belief(keyframe.index, keyframe.t_ns)
                 else:
                     belief = Belief(keyframe.t_ns, self._solver.state(keyframe.index), np.full((15, 15), np.nan))

@@ -243,7 +243,7 @@ class WindowPass:
             a = k & mask
             node, state = self._nodes[a], self._points[a : a + 1].copy()
             if t_ns >= self._covariance_due_ns:
-                self._covariance_due_ns = t_ns + self._config.hindsight_covariance_s * 1e9
+                self._covariance_due_ns = t_ns + self._config.smoothed_covariance_s * 1e9
                 if not self._swept:
                     self._smooth_covariances(k, newest - 1)
                 state["P"] = node["P_smoothed"]

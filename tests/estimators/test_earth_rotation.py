@@ -325,7 +325,7 @@ def test_all_estimators_are_one_on_a_turning_earth(spun: Log, name: str, options
 
 
 @pytest.mark.parametrize("options", [{}, {"keyframe_period_s": 2.0}], ids=str)
-def test_with_hindsight_too(spun: Log, options: dict[str, float]) -> None:
+def test_smoothed_too(spun: Log, options: dict[str, float]) -> None:
     assert apart(spun, "batch", "rts", "smoothed", **options) < 0.1
 
 
@@ -357,7 +357,7 @@ def small_mission(seed: int) -> Log:
 def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     """By part of the state: NEES summed over the seeds, at each epoch, per degree of freedom."""
     known = ESTIMATORS[name].__dataclass_fields__
-    every_tick = {"hindsight_covariance_s": 1e-3} if "hindsight_covariance_s" in known else {}
+    every_tick = {"smoothed_covariance_s": 1e-3} if "smoothed_covariance_s" in known else {}
     estimator, sums = create(name, earth_rotation=knows, **every_tick), {}
     for seed in range(SEEDS):
         log = small_mission(seed)
@@ -446,9 +446,9 @@ def test_at_rest_the_earth_tells_north(name: str, latitude_deg: float, seeds: in
         run = create(name, **OPTION).begin(prior, rig)
         for epoch in epochs:
             run.step(epoch)
-        beliefs, hindsight = [run.belief()], run.finish()
-        if name in ("rts", "batch"):  # with hindsight north is known from the beginning
-            beliefs.append(Belief(0, hindsight.state(0), hindsight.P[0]))
+        beliefs, smoothed = [run.belief()], run.finish()
+        if name in ("rts", "batch"):  # smoothed, north is known from the beginning
+            beliefs.append(Belief(0, smoothed.state(0), smoothed.P[0]))
         for belief in beliefs:
             R_WB = belief.state.R_WB
             errors.append(Rotation.from_matrix(R_WB @ truth.R_WB.T).as_rotvec()[2])

@@ -34,7 +34,7 @@ class Fake:
 
     answer: Callable[[int], tuple[NavState, np.ndarray]]
     act: Callable[[int], object] = lambda k: None
-    hindsight: Callable[[], Trajectory | None] = lambda: None
+    smoothed: Callable[[], Trajectory | None] = lambda: None
     factors: frozenset[str] = FACTORS
     seen: list[Epoch] | None = None
 
@@ -57,7 +57,7 @@ class FakePass:
         return Belief(self.t_ns, *self.fake.answer(self.t_ns))
 
     def finish(self) -> Trajectory | None:
-        return self.fake.hindsight()
+        return self.fake.smoothed()
 
 
 def truthful(log: Log, off: tuple[float, float, float] = (0.0, 0.0, 0.0), sigma: float = 2.0) -> Callable:
@@ -252,16 +252,16 @@ def test_an_estimator_that_cannot_begin_or_finish_fails(log: Log) -> None:
     def stuck() -> None:
         raise Diverged("indeterminate")
 
-    result = run_log(log, Fake(truthful(log), hindsight=stuck))
+    result = run_log(log, Fake(truthful(log), smoothed=stuck))
     assert (result.status, result.cause) == ("diverged", "indeterminate")
     assert result.failed_at_s == pytest.approx(30.0)
     assert list(result.outputs) == ["online"]
 
 
-def test_hindsight_comes_beside_what_was_said_at_the_time(log: Log) -> None:
+def test_smoothed_states_come_beside_the_online_ones(log: Log) -> None:
     assert log.truth is not None
     better = replace(log.truth.select(slice(100, None, 100)), lookahead_s=7.0)
-    result = run_log(log, Fake(truthful(log, (1.0, 0.0, 0.0)), hindsight=lambda: better))
+    result = run_log(log, Fake(truthful(log, (1.0, 0.0, 0.0)), smoothed=lambda: better))
     assert [(name, t.lookahead_s) for name, t in result.outputs.items()] == [("online", 0.0), ("smoothed", 7.0)]
     assert [scores(log, t)["ate_rmse_m"] for t in result.outputs.values()] == pytest.approx([1.0, 0.0])
 

@@ -85,8 +85,8 @@ def test_nees_stands_at_the_middles_of_equal_parts_of_the_log_and_is_the_same_ag
     assert json.dumps(nees_at(log, run_log(log, create("eskf")).online, 10)) == json.dumps(found)
 
 
-def test_hindsight_with_few_covariances_has_those_times_and_no_row_twice(log: Log) -> None:
-    smoothed = run_log(log, create("fls", hindsight_covariance_s=7.0)).smoothed
+def test_smoothed_states_with_few_covariances_are_scored_at_those_times_once_each(log: Log) -> None:
+    smoothed = run_log(log, create("fls", smoothed_covariance_s=7.0)).smoothed
     kept_s = (smoothed.t_ns[np.isfinite(smoothed.P[:, 0, 0])] - log.start_ns) * 1e-9
     found = nees_at(log, smoothed, 10)
     assert [t for t in found["t_s"] if t is not None] == pytest.approx(kept_s)

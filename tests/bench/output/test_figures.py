@@ -272,7 +272,7 @@ def test_the_figure_of_nees_has_a_line_per_output_and_the_band(judged: tuple[pd.
     blocks = ("position, 3 dof", "attitude, 3 dof", "velocity, 3 dof", "biases, 6 dof", "all, 15 dof")
     assert tuple(panel.get_title() for panel in axes[:5]) == blocks
     averages = [line for line in axes[4].lines if len(line.get_xdata()) == 6]
-    assert len(averages) == 4  # eskf, overconfident, rts online and with hindsight
+    assert len(averages) == 4  # eskf, overconfident, rts online and smoothed
     for band, probability in zip(axes[4].patches, (0.95, 1 - 0.001 / 6), strict=True):
         low, high = chi2.interval(probability, 75)
         assert [band.get_y(), band.get_y() + band.get_height()] == pytest.approx([low / 75, high / 75])

@@ -114,8 +114,8 @@ def test_the_best_of_each_block_is_bold_and_no_other() -> None:
             assert {label for label, cell in cells.items() if cell["bold"]} == {
                 label for label, cell in cells.items() if best is not None and cell["value"] == best
             }, column.score
-    online, hindsight = ({label: parse(cells[2])["value"] for label, cells in of.items()} for of in found.values())
-    assert min(online.values()) != min(hindsight.values())  # each block has a best of its own
+    online, smoothed = ({label: parse(cells[2])["value"] for label, cells in of.items()} for of in found.values())
+    assert min(online.values()) != min(smoothed.values())  # each block has a best of its own
 
 
 def test_what_did_not_end_every_run_is_said_and_not_ranked() -> None:

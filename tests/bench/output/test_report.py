@@ -34,7 +34,7 @@ SHOWN = [column.score for column in ACCURACY]
 pytestmark = pytest.mark.slow  # every test reads the page of a whole experiment, most of them in a browser
 
 EXPERIMENT = """
-description: "Does hindsight pay? <b>Not bold</b> & short."
+description: "Does smoothing pay? <b>Not bold</b> & short."
 logs: [{scenario: {duration_s: 40}}]
 estimators:
   - {name: dead-reckoning}

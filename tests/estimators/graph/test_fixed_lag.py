@@ -59,26 +59,26 @@ def test_filter_and_smoother_agree_online(mission: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [3.0, 10.0])
-def test_hindsight_beats_the_moment(lag_s: float) -> None:
+def test_smoothed_velocity_is_more_accurate_than_online(lag_s: float) -> None:
     """Pooled over seeds: a smoother that loses to its own filter has a bug. Velocity shows it best; position drifts."""
-    online = hindsight = 0.0
+    online = smoothed = 0.0
     for seed in range(3):
         log = simulate(Scenario(duration_s=60.0, imu="tactical"), seed=seed)
         result = run_log(log, create("fls", lag_s=lag_s))
         rows = np.searchsorted(log.truth.t_ns, result.online.t_ns)
         online += np.square(result.online.v_WB_W - log.truth.v_WB_W[rows]).sum()
-        hindsight += np.square(result.smoothed.v_WB_W - log.truth.v_WB_W[rows]).sum()
+        smoothed += np.square(result.smoothed.v_WB_W - log.truth.v_WB_W[rows]).sum()
         assert np.array_equal(result.smoothed.t_ns, result.online.t_ns)
         assert result.smoothed.lookahead_s == lag_s
-    assert hindsight < 0.8 * online
+    assert smoothed < 0.8 * online
 
 
-def test_hindsight_covariance_is_smaller_than_the_moments() -> None:
+def test_smoothed_covariance_is_smaller_than_online() -> None:
     result = run_log(simulate(Scenario(duration_s=60.0, imu="tactical"), seed=1), create("fls", lag_s=5.0))
     kept = np.isfinite(result.smoothed.P[:, 0, 0])
     assert 5 <= kept.sum() < len(kept)
-    online, hindsight = (np.einsum("nii->ni", t.P[kept]) for t in (result.online, result.smoothed))
-    assert (hindsight[:-1] <= online[:-1] * (1 + 1e-6)).all()
+    online, smoothed = (np.einsum("nii->ni", t.P[kept]) for t in (result.online, result.smoothed))
+    assert (smoothed[:-1] <= online[:-1] * (1 + 1e-6)).all()
 
 
 def test_one_second_keyframes_lose_nothing() -> None:
@@ -170,7 +170,7 @@ def test_late_readings_inside_the_window_are_used_and_older_ones_counted() -> No
 
 
 @pytest.mark.slow
-def test_a_late_reading_is_worth_the_same_in_hindsight() -> None:
+def test_a_late_reading_leads_to_the_same_smoothed_states() -> None:
     scenario = replace(TACTICAL, duration_s=60.0)
     in_time, late = simulate(scenario, seed=3), simulate(_late(scenario, 1.0), seed=3)
     heard = until(in_time, int(late.imu.t_ns[-1]) - 10**9, "gps", "heading")

@@ -155,7 +155,7 @@ def test_over_the_whole_log_both_engines_of_batch_end_at_one_optimum(options: di
 def test_a_lag_longer_than_the_log_is_batch(mission: str) -> None:
     log = simulate(replace(MINUTE, mission=mission), seed=3)
     ours, theirs = (
-        run_log(log, create("window", lag_s=100.0, hindsight_covariance_s=60.0, **TO_OPTIMUM)),
+        run_log(log, create("window", lag_s=100.0, smoothed_covariance_s=60.0, **TO_OPTIMUM)),
         run_log(log, create("batch")),
     )
     assert np.linalg.norm(ours.smoothed.p_WB_W - theirs.smoothed.p_WB_W, axis=1).max() < 1e-3
@@ -194,11 +194,11 @@ def test_online_it_is_the_filter_and_least_squares_so_far(seed: int, thorough: b
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_at_a_lag_its_hindsight_is_least_squares_on_what_had_been_seen_by_then(seed: int) -> None:
-    _, hindsight = run("window", seed)
-    n = len(hindsight)
-    assert apart(hindsight, [exact(seed, min(k + LAG + 1, n))[k] for k in range(n)]) < 1e-6
-    assert apart(hindsight[: -2 * LAG], exact(seed, n)[: -2 * LAG]) > 1e-3  # the window does matter
+def test_at_a_lag_smoothed_states_are_least_squares_on_the_readings_so_far(seed: int) -> None:
+    _, smoothed = run("window", seed)
+    n = len(smoothed)
+    assert apart(smoothed, [exact(seed, min(k + LAG + 1, n))[k] for k in range(n)]) < 1e-6
+    assert apart(smoothed[: -2 * LAG], exact(seed, n)[: -2 * LAG]) > 1e-3  # the window does matter
 
 
 # --- the chain against dense least squares ---------------------------------------------------------------------------
@@ -446,7 +446,7 @@ def test_a_prior_that_is_no_covariance_is_refused() -> None:
 
 
 def _counts(log: Log, **options: object) -> dict[str, int]:
-    result = run_log(log, create("window", hindsight_covariance_s=1e6, **options))
+    result = run_log(log, create("window", smoothed_covariance_s=1e6, **options))
     assert result.status == "done", result.cause
     return result.counts
 
@@ -486,7 +486,7 @@ def _us_per_keyframe(log: Log, name: str, **options: object) -> float:
 @pytest.mark.slow
 def test_a_lag_of_30_s_costs_at_most_twice_one_of_3_s() -> None:
     log = simulate(Scenario(duration_s=90.0, imu="tactical"), seed=4)
-    still = {"relinearize": [1e9] * 4, "hindsight_covariance_s": 1e6}
+    still = {"relinearize": [1e9] * 4, "smoothed_covariance_s": 1e6}
     us = np.array([[_us_per_keyframe(log, "window", lag_s=lag_s, **still) for lag_s in (3.0, 30.0)] for _ in range(9)])
     short, long = np.median(us[1:], axis=0)
     assert long < 2 * short, (short, long)
@@ -514,12 +514,12 @@ def _nees(truth: Trajectory, track: Trajectory, at_s: float, of: slice) -> float
 
 @pytest.mark.slow
 def test_over_twenty_seeds_it_errs_as_much_as_it_says() -> None:
-    """Online and with hindsight, at three times fixed beforehand; the 0.001 is shared among them."""
+    """Online and smoothed, at three times fixed beforehand; the 0.001 is shared among them."""
     n, times_s, parts = 20, (9.0, 29.0, 49.0), (slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 15))
     total = np.zeros((2, len(times_s), len(parts)))
     for seed in range(n):
         log = simulate(replace(MINUTE, **SLOW_SENSORS), seed=seed)
-        result = run_log(log, create("window", hindsight_covariance_s=1e-3))
+        result = run_log(log, create("window", smoothed_covariance_s=1e-3))
         for o, track in enumerate((result.online, result.smoothed)):
             total[o] += [[_nees(log.truth, track, at_s, of) for of in parts] for at_s in times_s]
     for p, of in enumerate(parts):
