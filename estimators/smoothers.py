@@ -1,4 +1,4 @@
-"""Options of every smoother, whatever solves it: on GTSAM (`graph`) or on our own solver (`window`)."""
+"""Options that all smoothers share, on GTSAM (`graph`) and on our own solver (`window`)."""
 
 from __future__ import annotations
 

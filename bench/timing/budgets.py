@@ -34,10 +34,10 @@ class Measured:
 
 @dataclass(frozen=True)
 class Budget:
-    """One row of section 8 of the design.
+    """One row of the table of budgets.
 
     Attributes:
-        name: what is measured, over what.
+        name: numerator and denominator.
         limit: the number asked for.
         least: whether it is the least allowed (else the most).
         measure: measures it.

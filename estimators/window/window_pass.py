@@ -122,7 +122,7 @@ class WindowPass:
     def finish(self) -> Trajectory | None:
         """See `Pass.finish`. States still in the window have seen less than the lag."""
         if self._lost:
-            raise Diverged("the estimate was lost before the end")
+            raise Diverged("the estimate diverged before the end")
         if not self._begun:
             return None
         self._follow(self._keyframes.finish())

@@ -125,7 +125,7 @@ SEEDS = [0, 1]
 
 
 def options(name: str, thorough: bool) -> dict[str, object]:
-    """As shipped, but for the lag and covariances at every tick; or linearising anew and carrying on whatever moves."""
+    """As shipped, but for the lag and covariances at every tick; or relinearising everything that moves."""
     wanted: dict[str, object] = {"lag_s": 0.2 * LAG, "smoothed_covariance_s": 1e-3}
     if thorough:
         wanted |= {"relinearize": [1e-9] * 4, "wildfire": 0.0}

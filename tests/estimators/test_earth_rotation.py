@@ -1,4 +1,4 @@
-"""With `earth_rotation` an estimator knows that the Earth turns: it returns to the truth, is honest, and finds north.
+"""With `earth_rotation` an estimator models the Earth's rotation: it returns to truth, is consistent, and finds north.
 
 Where the effect of one block is small beside a sigma, the Earth turns SPIN times too fast (simulator and rig take their
 rate from the same place), or W at a rate of its own.
@@ -41,7 +41,7 @@ NAVIGATION = IMU_GRADES["navigation"]
 OPTION = {"earth_rotation": True}
 
 
-# -- who is told of it ------------------------------------------------------------------------------------------------
+# -- where it is set --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -343,7 +343,7 @@ def test_a_smoother_at_long_intervals_stays_at_the_truth(name: str, dvl: str, mo
     assert np.abs(error / sigma).max() < 1.0
 
 
-# -- honesty ----------------------------------------------------------------------------------------------------------
+# -- consistency ------------------------------------------------------------------------------------------------------
 
 SEEDS = 20
 EPOCHS_S = np.array([10, 20, 30, 40, 50, 60])
@@ -380,7 +380,7 @@ def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
         ("fls", "online"),
     ],
 )
-def test_the_navigation_grade_is_honest_only_for_who_knows(name: str, output: str) -> None:
+def test_a_navigation_grade_imu_is_consistent_only_with_earth_rotation(name: str, output: str) -> None:
     for part, found in summed_nees(name, output, knows=True).items():
         dof = SEEDS * len(np.arange(15)[BLOCKS[part]])
         low, high = np.array(chi2.interval(1 - 0.001 / len(EPOCHS_S), dof)) / dof

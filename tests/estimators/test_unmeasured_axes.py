@@ -1,4 +1,4 @@
-"""Wheel speed is a velocity sensor of one axis: the others are left out, by everybody, whatever stands there."""
+"""Wheel speed is a velocity sensor of one axis: all estimators ignore the others, whose values are arbitrary."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_what_stands_in_an_axis_that_is_not_measured_has_no_influence(label, pat
 )
 def test_no_measurement_is_the_limit_of_a_poor_one(label, pattern):
     """But of a sum of velocities, in which a poor axis drowns the others; of a loss, whose width goes by the axes; and
-    of dead reckoning, which believes whatever has a sigma."""
+    of dead reckoning, which uses every value that has a sigma."""
     none, poor = said(label, pattern), said(label, pattern, 1e6, None)
     for output, trajectory in none.outputs.items():
         other = poor.outputs[output]

@@ -138,7 +138,7 @@ def test_a_short_imu_gap_is_bridged_counted_and_costs_certainty(log: Log, name: 
 
 
 @every
-def test_too_long_an_imu_gap_ends_the_run_where_it_begins_and_keeps_what_was_said(log: Log, name: str) -> None:
+def test_too_long_an_imu_gap_ends_the_run_where_it_begins_and_keeps_the_beliefs_before(log: Log, name: str) -> None:
     result = run_log(without_imu(log, 10.01, 13.0), create(name))
     assert result.status == "failed"
     assert result.cause.startswith("imu gap at 10.000 s: 3.0")

@@ -513,7 +513,7 @@ def test_levelling_is_the_least_turn_that_makes_up_point_up(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_f_tilts_as_the_gyro_says_whatever_the_mounting(seed: int) -> None:
+def test_f_tilts_with_the_gyro_at_any_mounting(seed: int) -> None:
     """A body that rocks on the spot: f is gravity in its axes, found here through rotation matrices."""
     rng, t_s = np.random.default_rng(seed), np.arange(0, 60, 0.01)
     angles = np.stack([0.1 * np.sin(0.9 * t_s), 0.2 * np.sin(0.5 * t_s + 1), 0.4 * t_s], axis=1)
@@ -559,7 +559,7 @@ def test_what_opening_had_to_drop_is_found_and_only_that(tmp_path: Path) -> None
     assert open_to_inspect(again)[1] == ()  # its history tells of a repair, but there is nothing to repair
 
 
-# the recorded logs, described as somebody might who has not read their READMEs
+# the recorded logs, described as by a user who has not read their READMEs
 
 MTI = {
     "file": "_040825_1735_MTI.log",
@@ -683,7 +683,7 @@ def of_stream(stream: ReadingStream, rows: Any = slice(None), z: float = 1.0, si
 
 
 def odd(what: str, log: Log) -> Log:
-    """A log that no vehicle wrote, but somebody's converter did."""
+    """A log as written by a converter, not by a vehicle."""
     imu = log.imu
     changed: dict[str, Any] = {
         "no force": {"imu": ImuStream(imu.t_ns, imu.w_WI_I, np.zeros_like(imu.f_I))},

@@ -352,7 +352,7 @@ def test_the_late_dvl_of_ictineu_does_not_show_in_its_streams(tmp_path: Path, re
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.9])
-def test_a_sigma_is_as_large_as_the_scatter_whatever_the_colour_of_the_noise(colour: float) -> None:
+def test_a_sigma_equals_the_scatter_for_noise_of_any_colour(colour: float) -> None:
     rng = np.random.default_rng(5)
     n, z = 1200, []
     x = np.sin(np.arange(n) / 40)

@@ -33,7 +33,7 @@ def test_the_interval_is_that_of_chi_square_over_its_degrees_of_freedom(probabil
 
 
 @pytest.mark.parametrize("dof", [3, 15])
-def test_honest_numbers_raise_as_many_false_alarms_as_they_should(dof: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_consistent_numbers_raise_the_expected_share_of_false_alarms(dof: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(consistency, "FALSE_ALARM", 0.1)
     rng, tables = np.random.default_rng(dof), 4000
     averages = [anees(rng.chisquare(dof, (20, 10)), dof, TIMES) for _ in range(tables)]
@@ -150,7 +150,7 @@ def voyages(name: str, **options: object) -> tuple[dict[str, consistency.Average
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["eskf", "iekf", "fls"])
-def test_who_is_told_the_right_noise_is_honest(name: str) -> None:
+def test_an_estimator_with_the_right_noise_is_consistent(name: str) -> None:
     nis, nees = voyages(name)
     assert set(nis) == {"dvl", "depth", "gps", "heading"}
     assert nis["dvl"].dof[0] == 20 * 60 * 5 * 3

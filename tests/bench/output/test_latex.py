@@ -225,7 +225,7 @@ def test_special_letters_are_escaped() -> None:
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here: LaTeX is not installed")
-def test_pdflatex_sets_it_whatever_somebody_called_things(tmp_path: Path) -> None:
+def test_pdflatex_sets_it_for_any_names(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     every = "".join(
         [*ESCAPED, *(f"e{accent}" for accent in ACCENTS), *(chr(0x391 + k) for k in range(58)), *map(chr, range(256))]

@@ -288,7 +288,7 @@ def test_an_output_is_compared_with_its_like_or_with_what_was_said_at_once() -> 
     ]
 
 
-def test_logs_are_paired_by_seed_whatever_the_order_of_rows() -> None:
+def test_logs_are_paired_by_seed_in_any_order_of_rows() -> None:
     rows = [run("calm", "e", s, s + 1.0) for s in range(7)] + [
         run("rough", "e", s, s + 3.0) for s in reversed(range(7))
     ]

@@ -134,7 +134,7 @@ def test_what_cannot_be_profiled_or_written_is_refused_in_one_line(
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not tell peaks of memory")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not report peak memory")
 def test_a_run_does_not_hide_in_the_memory_that_the_run_before_left() -> None:
     plan = Experiment.from_dict(
         {"name": "m", "logs": [{"scenario": {"duration_s": 60}}], "estimators": [{"name": "isam2"}], "seeds": [1]}

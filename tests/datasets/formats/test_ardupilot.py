@@ -1,4 +1,4 @@
-"""Dataflash logs: read as pymavlink's own reader reads them, in chunks of any size, and whatever they have suffered."""
+"""Dataflash logs: read as pymavlink's own reader reads them, in chunks of any size, damaged or not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables, arrays and TUM files: read piece by piece, the same whatever the pieces; memory is that of what is kept."""
+"""Tables, arrays and TUM files: read in pieces of any size, with the same result; memory is that of the kept rows."""
 
 from __future__ import annotations
 

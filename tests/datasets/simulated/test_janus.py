@@ -1,4 +1,4 @@
-"""Bottom lock: which beams reach the seabed, and what is said of the velocity that they give."""
+"""Bottom lock: which beams reach the seabed, and the velocity and sigma that they give."""
 
 import dataclasses
 

@@ -210,10 +210,10 @@ def test_soft_iron_deviates_a_heading_twice_around():
     assert deviation_deg.min() < -2.5
 
 
-# -- telling, and what is refused
+# -- notes, and what is refused
 
 
-def test_the_sea_is_told():
+def test_the_sea_is_noted():
     scenario = Scenario(
         duration_s=20,
         waves=WAVES,

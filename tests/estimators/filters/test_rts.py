@@ -74,7 +74,7 @@ def test_its_last_state_is_the_filters_and_its_times_are_the_ticks() -> None:
 
 
 def test_late_readings_leave_no_trace_in_the_smoothed_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Epochs that were lived again replace those that they were lived for, across pages."""
+    """Replayed epochs replace the stored ones, across pages."""
     monkeypatch.setattr(rts, "PAGE", 7)
     logs = simulate(Scenario(duration_s=30.0), seed=5), simulate(Scenario(duration_s=30.0, **DELAYED), seed=5)
     last_ns = int(logs[1].imu.t_ns[-1] - 1e9)
@@ -104,7 +104,7 @@ def test_smoothed_states_are_more_accurate_than_the_filter(mission: str) -> None
 
 @pytest.mark.parametrize("seed", range(3))
 def test_smoothing_over_an_interval_of_zero_changes_nothing(seed: int) -> None:
-    """No motion and no noise: whatever is known later is known now, a radian away and to the last digit of P."""
+    """Without motion and noise, smoothed equals filtered, with a state a radian away and to the last digit of P."""
     rng = np.random.default_rng(seed)
     x, M = random_state(rng), rng.normal(size=(2, 15, 15))
     now = as_record(Belief(0, x, M[0] @ M[0].T))

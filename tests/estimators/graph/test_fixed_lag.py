@@ -1,4 +1,4 @@
-"""The smoother agrees with the filter, with dense least squares, and with itself whatever the keyframes."""
+"""The smoother agrees with the filter, with dense least squares, and with itself for any choice of keyframes."""
 
 from __future__ import annotations
 
@@ -412,8 +412,8 @@ def test_dvl_readings_out_of_order_are_summed_in_order() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "honest"), [("straight", True), ("held", False)])
-def test_preintegration_straight_is_honest_and_held_is_known_not_to_be(mode: str, honest: bool) -> None:
+@pytest.mark.parametrize(("mode", "consistent"), [("straight", True), ("held", False)])
+def test_preintegration_is_consistent_when_straight_and_overconfident_when_held(mode: str, consistent: bool) -> None:
     """Velocity NEES over 20 seeds: holding loses what the vehicle does between readings, and nobody counts that."""
     total, n = 0.0, 20
     for seed in range(n):
@@ -421,7 +421,7 @@ def test_preintegration_straight_is_honest_and_held_is_known_not_to_be(mode: str
         result = run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between=mode))
         total += float(nees(error_states(log.truth, result.online), result.online.P, BLOCKS["velocity"])[49])
     low, high = chi2.interval(0.999, 3 * n)
-    assert (low < total < high) == honest, total / n
+    assert (low < total < high) == consistent, total / n
 
 
 @pytest.mark.slow

@@ -117,7 +117,7 @@ def test_at_a_lag_it_reaches_gtsams_optimum(dvl: str) -> None:
     ],
     ids=["lawnmower", "yo-yo", "yo-yo at 10 s", "tight and velocity", "sparse", "late", "odd", "robust"],
 )
-def test_at_a_lag_it_reaches_gtsams_optimum_whatever_it_is_given(change: dict, options: dict) -> None:
+def test_at_a_lag_it_reaches_gtsams_optimum_for_all_sensors_and_options(change: dict, options: dict) -> None:
     log = simulate(replace(SHORT, duration_s=30.0, **change), seed=3)
     assert_one(run_log(log, create("window", **TO_OPTIMUM, **options)), run_log(log, create("fls-batch", **options)))
 
@@ -451,7 +451,7 @@ def _counts(log: Log, **options: object) -> dict[str, int]:
     return result.counts
 
 
-def test_a_step_factors_two_blocks_whatever_the_lag_as_long_as_nothing_moves() -> None:
+def test_a_step_factors_two_blocks_at_any_lag_if_nothing_moves() -> None:
     """The one that gains a tie and, with it, the new one."""
     log = simulate(replace(MINUTE, **SLOW_SENSORS), seed=4)
     for lag_s in (3.0, 30.0):
@@ -504,7 +504,7 @@ def test_batch_has_its_optimum_of_ten_minutes_in_two_seconds() -> None:
     assert perf_counter() - started < 2.0
 
 
-# --- honesty ---------------------------------------------------------------------------------------------------------
+# --- consistency -----------------------------------------------------------------------------------------------------
 
 
 def _nees(truth: Trajectory, track: Trajectory, at_s: float, of: slice) -> float:
