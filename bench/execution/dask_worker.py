@@ -1,4 +1,4 @@
-"""What runs on a worker of a Dask cluster: one run at a time, in a process like a local worker's.
+"""The worker's side of a Dask cluster: one run at a time, in a process like a local worker's.
 
 The run has a process of its own, because Dask's process must answer the scheduler: GTSAM holds Python's lock through
 long calls, and a worker that is silent for minutes counts as dead. The process also keeps Dask's work out of the

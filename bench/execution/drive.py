@@ -31,7 +31,7 @@ ON_TIME_NS = 1_000_000
 
 
 class Ending(NamedTuple):
-    """How a run ended, and when; t_ns is None for one that came to its end."""
+    """How a run ended, and when; t_ns is None if it reached the end of the log."""
 
     status: Status
     cause: str | None = None

@@ -1,4 +1,4 @@
-"""An experiment as its YAML file says it: entries that may each stand for many logs or estimators."""
+"""The content of an experiment file: entries, each of which may stand for many logs or estimators."""
 
 from __future__ import annotations
 

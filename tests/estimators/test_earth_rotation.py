@@ -230,7 +230,7 @@ def test_ten_noise_free_minutes_on_a_turning_earth_return_to_the_truth(
 
 
 @pytest.mark.parametrize("latitude_deg", [0.0, 52.0, -75.0])
-def test_at_rest_the_earth_displaces_who_does_not_know_of_it_by_the_closed_form(latitude_deg: float) -> None:
+def test_at_rest_the_earth_displaces_an_estimator_that_ignores_it_by_the_closed_form(latitude_deg: float) -> None:
     """The attitude turns away at Ω, and with it the specific force: ∬ (Exp(Ω t) − 1) (0, 0, g) dt², 26 km · cos φ.
 
     Who knows stays, but for the centrifugal force of the lever arm, which `imu` says is left out.
@@ -434,7 +434,7 @@ def moored(seed: int, latitude_deg: float) -> tuple[Rig, Belief, NavState, list[
         pytest.param("batch", 45.0, 3, marks=pytest.mark.slow),
     ],
 )
-def test_at_rest_the_earth_tells_north(name: str, latitude_deg: float, seeds: int) -> None:
+def test_at_rest_the_earths_rate_gives_north(name: str, latitude_deg: float, seeds: int) -> None:
     """Ω cos φ points north. A heading that is wrong by ψ is an eastward rate of Ω cos φ ψ, which is seen as tilting.
 
     What limits it is the gyro: its bias, b, and after T seconds what its noise, of density N, averages to:

@@ -129,7 +129,7 @@ def test_readings_with_an_axis_unmeasured_are_not_summed():
 
 
 @pytest.mark.parametrize("label", RECKONERS)
-def test_dead_reckoning_goes_where_its_nose_says(label):
+def test_dead_reckoning_goes_where_its_nose_points(label):
     online = said(label, "wheel").online
     v_B = np.einsum("nji,nj->ni", online.R_WB, online.v_WB_W)
     np.testing.assert_allclose(v_B[:, 1:], 0, atol=1e-12)

@@ -269,7 +269,7 @@ def test_a_recorded_log_comes_out_identical_too(recorded: Path) -> None:
     assert "not" not in out.partition("came out identical")[0].partition("eskf")[2]
 
 
-def test_a_log_described_otherwise_is_told_from_one_with_other_readings(recorded: Path, tmp_path: Path) -> None:
+def test_another_description_is_distinguished_from_other_readings(recorded: Path, tmp_path: Path) -> None:
     description = tmp_path / "dive" / "log.yaml"
     text = description.read_text()
     description.write_text(text + "\n# more said\n")
@@ -286,7 +286,7 @@ def test_a_log_described_otherwise_is_told_from_one_with_other_readings(recorded
     assert "the readings must have changed" in out
 
 
-def test_a_log_that_is_gone_is_said_and_nothing_is_run(recorded: Path, tmp_path: Path) -> None:
+def test_a_log_that_is_gone_is_reported_and_nothing_is_run(recorded: Path, tmp_path: Path) -> None:
     rmtree(tmp_path / "dive")
     code, out, _ = call("reproduce", recorded)
     assert code == 2
@@ -344,7 +344,7 @@ def test_every_option_of_every_estimator_survives_the_store() -> None:
         assert create(name.name, **as_stored) == name.create()
 
 
-def test_the_machine_tells_what_decides() -> None:
+def test_the_machine_has_the_facts_that_affect_rounding() -> None:
     found = machine.machine()
     assert set(machine.DECIDES) < set(found)
     assert all(found[name] for name in ("architecture", "compiled_for", "blas"))

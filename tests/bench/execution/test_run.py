@@ -233,7 +233,7 @@ def test_without_truth_it_runs_on_a_grid_and_scores_are_absent_not_zero(log: Log
     assert set(scores(blind, result.online).values()) == {None}
 
 
-def test_without_prior_one_is_made_and_told(log: Log) -> None:
+def test_without_prior_one_is_made_and_reported(log: Log) -> None:
     result = run_log(replace(log, prior=None), create("dead-reckoning"))
     assert result.status == "done"
     assert result.notes
@@ -362,7 +362,7 @@ class Believing(Fake):
     inflate: dict[str, float] | None = None
 
 
-def test_who_knows_the_truth_has_the_sensors_noise_for_innovations(log: Log) -> None:
+def test_an_estimator_with_the_truth_has_the_sensors_noise_for_innovations(log: Log) -> None:
     """Theory by another road than any filter's: r is the reading's own error, and S its own covariance."""
     result = run_log(log, Believing(truthful(log, sigma=1e-9), inflate={"heading": 0.5}), nis=True)
     dof = innovation_dof(result)

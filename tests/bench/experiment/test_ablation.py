@@ -219,7 +219,7 @@ def test_a_log_is_compared_with_its_baseline_estimator_by_estimator() -> None:
     ]
 
 
-def test_a_log_may_name_who_runs_on_it_and_who_does_not_is_not_compared() -> None:
+def test_a_log_may_name_its_estimators_and_only_those_are_compared() -> None:
     plan = experiment(
         logs=[{"name": "all", "scenario": SHORT}, {"name": "some", "scenario": SHORT, "estimators": ["eskf no *"]}],
         estimators=[{"name": "eskf", "drop": ["gps", "dvl"]}],

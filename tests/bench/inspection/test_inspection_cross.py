@@ -365,7 +365,7 @@ def test_a_sigma_equals_the_scatter_for_noise_of_any_colour(colour: float) -> No
     assert 0.7 < np.std(z) < 1.4  # Student's t of 11 degrees of freedom: 1.11
 
 
-def test_what_the_data_do_not_fix_has_a_sigma_that_says_so() -> None:
+def test_what_the_data_do_not_fix_has_a_sigma_that_is_reported() -> None:
     rng = np.random.default_rng(2)
     t = np.linspace(0, 1, 600)
     fit = least_squares({"a": t, "b": t * (1 + 1e-9)}, t + 0.01 * rng.standard_normal(600), blocks_of(600))

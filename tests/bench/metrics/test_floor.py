@@ -369,7 +369,7 @@ def test_the_ratio_is_of_pooled_squares_and_its_interval_is_paired() -> None:
             rmse_over_floor(*bad)
 
 
-def test_the_interval_covers_the_true_ratio_about_as_often_as_it_says() -> None:
+def test_the_interval_covers_the_true_ratio_about_as_often_as_stated() -> None:
     """Squared errors of six degrees of freedom, 1.44 of the bound on average; and a surer interval is a wider one."""
     rng, covered, trials, level = np.random.default_rng(1), 0, 300, 0.9
     for seed in range(trials):

@@ -209,7 +209,7 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path
     return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
 
 
-def test_the_consistency_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_the_consistency_table_marks_the_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     summary = {(row["label"], row["output"]): row for row in summarise(rows)}
     consistent, wrong = summary["eskf", "online"], summary["overconfident", "online"]
@@ -381,7 +381,7 @@ DEUTERANOPIA = ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413),
 
 
 @pytest.mark.parametrize("vision", [np.eye(3), PROTANOPIA, DEUTERANOPIA], ids=["all", "protan", "deutan"])
-def test_the_first_six_colours_are_told_apart_by_any_eye(vision: tuple[tuple[float, ...], ...]) -> None:
+def test_the_first_six_colours_are_distinguished_by_any_eye(vision: tuple[tuple[float, ...], ...]) -> None:
     """As Machado, Oliveira & Fernandes 2009 (doi:10.1109/TVCG.2009.113) have it, in CIELAB; 2.3 is just noticeable."""
     rgb = np.array([to_rgb(colour) for colour in PALETTE[:6]])
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

@@ -118,7 +118,7 @@ def test_the_best_of_each_block_is_bold_and_no_other() -> None:
     assert min(online.values()) != min(smoothed.values())  # each block has a best of its own
 
 
-def test_what_did_not_end_every_run_is_said_and_not_ranked() -> None:
+def test_what_did_not_end_every_run_is_reported_and_not_ranked() -> None:
     rows = table()
     lost = (rows["label"] == "eskf") & (rows["seed"] == 3)
     rows.loc[lost, "status"] = "diverged"

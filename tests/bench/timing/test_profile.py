@@ -126,7 +126,7 @@ def test_of_each_step_the_quickest_is_taken_with_its_own_parts() -> None:
     assert best.finish_ns == 90
 
 
-def test_a_run_in_a_process_of_its_own_says_what_it_says_here_and_which_steps_it_took(log: Log) -> None:
+def test_a_run_in_a_process_of_its_own_gives_the_same_result_as_here_and_which_steps_it_took(log: Log) -> None:
     from fathom.bench import run_log
 
     here = run_log(log, create("eskf"))
@@ -143,7 +143,7 @@ def test_a_run_in_a_process_of_its_own_says_what_it_says_here_and_which_steps_it
         process.run(log, create("eskf"))  # still works
 
 
-def test_growth_is_told_from_flatness() -> None:
+def test_growth_is_distinguished_from_flatness() -> None:
     rng = np.random.default_rng(3)
     t_s = np.arange(0.01, 1200.0, 0.01)
     noise = rng.gamma(2.0, 5_000.0, len(t_s))

@@ -62,7 +62,7 @@ def test_without_a_word_the_first_half_of_the_seeds_trains_and_recorded_logs_tak
     assert split.aside == ["a"]
 
 
-def test_the_experiment_may_say_who_trains_and_the_command_line_overrules_it(tmp_path: Path) -> None:
+def test_the_experiment_may_name_the_training_runs_and_the_command_line_overrules_it(tmp_path: Path) -> None:
     plan = experiment(seeds=4, tune={"held_out": ["sim/4"]})
     assert [run.seed for run in prepare(plan, out=tmp_path).split.train] == [1, 2, 3]
     split = prepare(plan, sides=SplitPatterns(train=("sim/[23]",)), out=tmp_path).split
@@ -265,7 +265,7 @@ def test_the_same_seed_gives_the_same_search_and_another_seed_another(tmp_path, 
     assert [trial.factors for trial in first[1:]] != [trial.factors for trial in third[1:]]
 
 
-def test_another_range_estimator_or_log_begins_a_new_study_and_says_so(tmp_path, monkeypatch) -> None:
+def test_another_range_estimator_or_log_begins_a_new_study_and_is_reported(tmp_path, monkeypatch) -> None:
     one = prepare(experiment(), out=tmp_path)
     go(one, monkeypatch, Sea(valley), 5)
     with searching(one) as search:
@@ -295,7 +295,7 @@ def test_a_trial_that_diverges_is_a_bad_one_and_no_crash(tuning, monkeypatch) ->
     assert np.mean(np.array(later) > 1) > 0.7  # the search learns to stay away
 
 
-def test_where_every_trial_goes_wrong_the_search_ends_and_says_why(tuning, monkeypatch) -> None:
+def test_where_every_trial_fails_the_search_ends_and_says_why(tuning, monkeypatch) -> None:
     sea = Sea(lambda *_: None)
     with pytest.raises(ExperimentError, match="eskf: no trial finished; sim/1: diverged: lost"):
         go(tuning, monkeypatch, sea)
@@ -329,7 +329,7 @@ def test_a_gain_on_training_alone_is_warned_of(tuning, monkeypatch) -> None:
     assert any("is not confirmed on held-out runs" in warning for warning in outcome.warnings)
 
 
-def test_a_smaller_gain_on_what_is_held_out_is_told_apart_from_none(tuning, monkeypatch) -> None:
+def test_a_smaller_gain_on_what_is_held_out_is_distinguished_from_none(tuning, monkeypatch) -> None:
     def half(factors: dict[str, float], log: str, seed: int | None) -> float:
         share = 1.0 if seed is not None and seed <= 6 else 0.3
         return valley(factors, log, seed) ** share
@@ -338,7 +338,7 @@ def test_a_smaller_gain_on_what_is_held_out_is_told_apart_from_none(tuning, monk
     assert warning.startswith("training and held-out part: a gain of ")
 
 
-def test_the_best_at_an_end_of_the_range_is_told(tuning, monkeypatch) -> None:
+def test_the_best_at_an_end_of_the_range_is_reported(tuning, monkeypatch) -> None:
     outcome = end(tuning, monkeypatch, lambda factors, *_: 1 / factors["dvl"], 40)
     assert any(warning.startswith("dvl: the best factor, ") for warning in outcome.warnings)
 

@@ -325,7 +325,7 @@ EVERYTHING = {
 }
 
 
-def test_a_log_with_every_kind_of_fault_can_be_cut_and_is_told():
+def test_a_log_with_every_kind_of_fault_can_be_cut_and_is_reported():
     log = simulate(Scenario.from_dict({"duration_s": 120, **EVERYTHING}), 2)
     assert cut(log).failure is None
     assert list(log.notes[3:]) == [

@@ -102,7 +102,7 @@ def test_without_noise_the_prior_is_the_state_at_the_end_of_the_window(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_says(seed):
+def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_predicts(seed):
     log, state, _ = voyage(seed, noisy=False)
     b_a = np.random.default_rng(seed).normal(size=3) * 0.05
     biased = initialise(replace(log, imu=replace(log.imu, f_I=log.imu.f_I + b_a))).belief
@@ -115,7 +115,7 @@ def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_says(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_wrong_heading_turns_the_velocity_as_the_covariance_says(seed):
+def test_a_wrong_heading_turns_the_velocity_as_the_covariance_predicts(seed):
     log, state, _ = voyage(seed, noisy=False)
     assert log.heading is not None
     wrong = initialise(replace(log, heading=replace(log.heading, z=log.heading.z + 0.03))).belief

@@ -195,7 +195,7 @@ def test_a_silent_dvl_leaves_keyframes_to_the_others() -> None:
     assert 36 <= result.counts["keyframes"] <= 43
 
 
-def test_what_no_sensor_tells_of_stays_unknown_when_a_keyframe_has_turned() -> None:
+def test_what_no_sensor_measures_stays_unknown_when_a_keyframe_has_turned() -> None:
     """Late DVL readings turn the first keyframes by a degree after depth has fixed their height to a centimetre.
 
     Seen in axes off by as much, the metre that nobody knows of east and north would look like one of height.

@@ -114,7 +114,7 @@ def _plain() -> tuple[Log, Driven]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
-def test_with_normal_noise_a_loss_changes_little_and_counts_what_theory_says(loss: Loss) -> None:
+def test_with_normal_noise_a_loss_changes_little_and_counts_the_share_of_theory(loss: Loss) -> None:
     """The plain estimate is efficient, so the robust one's variance is the plain one's plus that of their difference
     (Hausman 1978): 1/0.95 − 1 of a variance. Positions are three numbers over such a log, their course is smooth. An
     estimate leans towards each reading, which hides at most a tenth of a residual's variance here.

@@ -165,7 +165,7 @@ def test_a_lag_longer_than_the_log_is_batch(mission: str) -> None:
     assert np.linalg.norm(ours.smoothed.p_WB_W - engine.smoothed.p_WB_W, axis=1).max() < 1e-5
 
 
-def test_as_shipped_it_says_what_fls_says() -> None:
+def test_as_shipped_it_equals_fls() -> None:
     """From the second tick on: at the first, iSAM2 leaves be what ours has linearised anew."""
     log = simulate(SHORT, seed=4)
     ours, theirs = run_log(log, create("window")), run_log(log, create("fls"))
@@ -372,7 +372,7 @@ def test_a_tie_is_the_imu_residual_solved_for_the_later_keyframe(seed: int) -> N
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_prior_said_elsewhere_is_its_residual_solved_for_the_state(seed: int) -> None:
+def test_a_prior_at_another_point_is_its_residual_solved_for_the_state(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, mean, P = random_state(rng), 0.1 * rng.normal(size=DIM), _covariance(rng, 0.2)
     x = a.retract(0.3 * rng.normal(size=DIM))
@@ -513,7 +513,7 @@ def _nees(truth: Trajectory, track: Trajectory, at_s: float, of: slice) -> float
 
 
 @pytest.mark.slow
-def test_over_twenty_seeds_it_errs_as_much_as_it_says() -> None:
+def test_over_twenty_seeds_its_errors_match_its_covariance() -> None:
     """Online and smoothed, at three times fixed beforehand; the 0.001 is shared among them."""
     n, times_s, parts = 20, (9.0, 29.0, 49.0), (slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 15))
     total = np.zeros((2, len(times_s), len(parts)))
