@@ -1,4 +1,4 @@
-"""How every figure looks: one look per estimator, panels, axes, legends, and the files they are saved as.
+"""Style of all figures: one look per estimator, panels, axes, legends, and the files they are saved as.
 
 Figures are made for a journal's page: one or two columns wide, letters of 7 and 8 points, TrueType fonts in the PDF.
 Markers and dashes repeat what colours say, for grey prints.

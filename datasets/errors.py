@@ -105,7 +105,7 @@ def _followed(loc: Sequence[str | int], model: Any) -> tuple[list[str | int], li
 
 
 def _members(kind: Any) -> Iterator[Any]:
-    """Yield what a union is one of; the type itself where it is none."""
+    """Yield the members of a union; or the type itself if it is no union."""
     bare = _bare(kind)
     if get_origin(bare) in (Union, UnionType):
         for member in get_args(bare):

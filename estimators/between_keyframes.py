@@ -1,4 +1,4 @@
-"""Beliefs between keyframes: carried on by the IMU and corrected as a filter would; the smoother does not see that."""
+"""Beliefs between keyframes: predicted by the IMU and corrected as in a filter; the smoother does not use them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def carry_on(
     state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], now_ns: int,
     waiting: Sequence[NDArray[Any]] = (), losses: Mapping[str, Loss] | None = None,
 ) -> None:  # fmt: skip
-    """Carry a belief at a keyframe on to now_ns, in place, and correct it by the readings that wait.
+    """Predict a belief at a keyframe to now_ns, in place, and correct it by the waiting readings.
 
     Args:
         state: STATE record.
@@ -46,11 +46,11 @@ def carry_on(
             propagate(state, rig, before, part, block)
             before = part[-1:]
         if reading is not None and not correct(state, rig, weighted(reading, state, rig, losses or {})):
-            raise Diverged("the innovation covariance is not positive, or the state is not finite")
+            raise Diverged("the innovation covariance is not positive definite, or the state is not finite")
 
 
 def weighted(reading: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], losses: Mapping[str, Loss]) -> NDArray[Any]:
-    """Return a reading with the noise that its loss leaves it with at a predicted state, a STATE record."""
+    """Return a reading with the noise that corresponds to its weight under its loss, at a predicted STATE record."""
     loss = losses.get(SENSOR[int(reading["kind"][0])])
     r, H, C = np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
     if loss is None or not (n := measure(reading, 0, state, rig, r, H, C)):

@@ -45,7 +45,7 @@ def sources() -> tuple[Path, ...]:
 
 
 def code_of(source: str) -> str:
-    """Return what a source says once comments, docstrings, types of functions and places in the file are left out."""
+    """Return a source without its comments, docstrings, type annotations and line numbers."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
         if isinstance(node, ast.arg):
@@ -67,7 +67,7 @@ def key_of(texts: Iterable[tuple[str, str]], notes: Path) -> str:
 
     Args:
         texts: name and content of each.
-        notes: folder where it is noted which texts say the same code, so that a process need not parse them.
+        notes: folder that records which texts are the same code, so that a process need not parse them.
     """
     content = list(texts)
     machine = [sys.version, numba.__version__, np.__version__, llvm.get_host_cpu_name(), *_flags()]
@@ -141,7 +141,7 @@ def _forget_oldest(base: Path, notes: Path) -> None:
 
 
 class Locator(caching._CacheLocator):
-    """Tells numba where our functions' code is kept, and by what it is known."""
+    """Tells numba the folder and the key of our functions' compiled code."""
 
     def __init__(self, py_func: Any, py_file: str) -> None:
         self._py_file, self._path = py_file, Path(py_file).resolve()

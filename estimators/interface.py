@@ -1,4 +1,4 @@
-"""What an estimator is: a frozen configuration that begins passes, and a pass that is driven through one log."""
+"""The interface of estimators: `Estimator`, a frozen configuration, and `Pass`, one run over one log."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ KEYFRAME, AT_KEYFRAME, CARRIED, SUMMED, SOLVE = np.arange(5)  # no literals, for
 WAITS, BEGINS, GONE = range(3)
 """Of a row: given out with the next keyframe; given out, and summed over the interval that it begins; not needed."""
 NO_ROOM, UNKNOWN_KIND = -1, -2
-"""What `decide` answers instead of a number of orders, nothing being done."""
+"""Returned by `decide` instead of a number of orders; nothing has been done then."""
 
 PLAN = np.dtype(
     [
@@ -120,7 +120,7 @@ class Keyframes:
         return self._decide(now_ns, readings, False)
 
     def finish(self) -> NDArray[np.int64]:
-        """Return the last orders: a keyframe at the end, and all that still waits given to it."""
+        """Return the last orders: a keyframe at the end, with all waiting readings."""
         return self._decide(int(self._plan["now_ns"][0]), NO_READINGS, True)
 
     def not_given_out(self) -> list[Records]:
@@ -159,7 +159,7 @@ def decide(
     plan: Records, times: TimeArray, rows: Records, roles: NDArray[np.int64], orders: NDArray[np.int64],
     readings: Records, now_ns: int, closing: bool,
 ) -> int:  # fmt: skip
-    """Write down what to do with the readings of an epoch, or at the end of a log; return how many orders there are.
+    """Fill `orders` for the readings of an epoch, or for the end of a log; return their number.
 
     Args:
         plan: PLAN record of length 1.
@@ -199,7 +199,7 @@ def decide(
 
 @inner
 def order(plan: Records, orders: NDArray[np.int64], what: Any, keyframe: Any, x: Any) -> None:
-    """Write an order down."""
+    """Append an order."""
     n = plan[0].orders
     orders[n, 0], orders[n, 1], orders[n, 2] = what, keyframe, x
     plan[0].orders = n + 1

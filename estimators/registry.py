@@ -57,7 +57,7 @@ def load_estimator(name: str) -> Any:
     point = _plugins()[name]
     try:
         return point.load()
-    except Exception as error:  # whatever somebody's module does when it is imported
+    except Exception as error:  # importing another package's module may raise anything
         raise EstimatorError(f"{name}: {not_loaded(point, error)}") from error
 
 

@@ -1,4 +1,4 @@
-"""Robust losses: a reading that lies far out pulls less, or not at all.
+"""Robust losses: an outlier gets less weight, or none.
 
 A loss ρ(d) of the whitened residual's length d replaces ½ d²; smoothers solve by weights w(d) = ρ'(d) / d, taken
 where a factor is linearised:
@@ -7,7 +7,7 @@ where a factor is linearised:
 
 The widths k are those of 95 % efficiency on one normal row: Holland & Welsch 1977, doi:10.1080/03610927708827533, and
 Zhang 1997, doi:10.1016/S0262-8856(96)01112-2, table 1. A residual of n rows gets the width that a normal one exceeds as
-often, P(χ²_n > k_n²) = P(χ²_1 > k_1²): the same reading is as suspect, however many rows it has.
+often, P(χ²_n > k_n²) = P(χ²_1 > k_1²): the number of rows does not matter.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Loss = Literal["huber", "cauchy", "tukey"]
 WIDTHS: dict[Loss, float] = {"huber": 1.345, "cauchy": 2.3849, "tukey": 4.6851}
 """Sigmas, for one row."""
 LOSSES: tuple[str, ...] = ("", "huber", "cauchy", "tukey")
-"""Losses by number, for compiled code; 0 is none."""
+"""Losses by number, for compiled code; 0 means no loss."""
 Losses = Annotated[dict[str, Loss], sensors_among(FACTORS)]
 """Loss by sensor; a sensor that is not named has none."""
 

@@ -1,4 +1,4 @@
-"""Options of every smoother, whatever solves it: on GTSAM (`graph`) or on our own solver (`window`)."""
+"""Options that all smoothers share, on GTSAM (`graph`) and on our own solver (`window`)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class GraphSmoother(ABC):
             marginalised out. Tukey's loss and, less so, Cauchy's can have several minima: a reading beyond the width at
             the first guess, the IMU's prediction, has no weight until other readings move the estimate. So a vehicle
             whose error exceeds the width never uses that sensor again.
-        hindsight_covariance_s: smoothed states keep their covariance at this period.
+        smoothed_covariance_s: smoothed states keep their covariance at this period.
         earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
 
@@ -75,7 +75,7 @@ class GraphSmoother(ABC):
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     robust: Losses = Field(default_factory=dict)
-    hindsight_covariance_s: Positive = 5.0
+    smoothed_covariance_s: Positive = 5.0
     earth_rotation: bool = False
 
     @property

@@ -10,7 +10,7 @@ from fathom.datasets import Log, open_log
 
 @pytest.fixture(scope="session")
 def recorded_data() -> Path:
-    """The folder of recordings: FATHOM_DATA, else shared/data beside the repository; skips where there is none."""
+    """The folder of recordings: FATHOM_DATA, else shared/data beside the repository; skips the test without it."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "data"
     folder = Path(os.environ.get("FATHOM_DATA") or beside)
     if not folder.is_dir():

@@ -41,7 +41,9 @@ def tune(
     ] = 60,
     score: Annotated[
         str,
-        typer.Option(help="Score from `fathom list scores`: errors are minimised, NEES and NIS brought to their due."),
+        typer.Option(
+            help="Score from `fathom list scores`; NEES, NIS and coverage are brought to their expected value."
+        ),
     ] = "ate_rmse_m",
     output: Annotated[Output, typer.Option(help="Score the online or the smoothed trajectory.")] = Output.online,
     span: Annotated[float, typer.Option(min=1.01, help="Factors are searched from 1/SPAN to SPAN.")] = 10.0,
@@ -57,15 +59,15 @@ def tune(
     checked once on held-out logs. Without --train, --held-out or `tune:` in the experiment, the first half of the seeds
     of a simulated log is used for training. An interrupted search continues with the same command.
     """
-    from ..experiment.plan import Experiment, Sides
+    from ..experiment.plan import Experiment, SplitPatterns
     from ..tuning.objective import Objective
     from ..tuning.outcome import judge, print_outcome, run_with_bar, write_outcome
     from ..tuning.search import searching
     from ..tuning.tuning import prepare
 
-    plan, sides = Experiment.load(experiment), Sides(tuple(train or ()), tuple(held_out or ()))
+    plan, patterns = Experiment.load(experiment), SplitPatterns(tuple(train or ()), tuple(held_out or ()))
     objective = Objective(score, output.value)
-    tuning = prepare(plan, estimator, sides, sensor or (), objective, (1 / span, span), seed, out, data, repair)
+    tuning = prepare(plan, estimator, patterns, sensor or (), objective, (1 / span, span), seed, out, data, repair)
     with (
         on_interrupt(f"interrupted: finished trials are kept in {tuning.folder}; the same command continues"),
         searching(tuning) as search,

@@ -1,4 +1,4 @@
-"""How every verb ends: bad input is one line on standard error and status 2; Ctrl-C is status 130."""
+"""Exit of every verb: bad input is one line on standard error and status 2; Ctrl-C is status 130."""
 
 from __future__ import annotations
 

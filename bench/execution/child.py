@@ -35,7 +35,7 @@ class Child:
     process: Popen[bytes]
 
     def kill(self) -> None:
-        """End the process, whatever it is doing."""
+        """Kill the process at once."""
         self.process.kill()
         self.process.wait()
         self.connection.close()

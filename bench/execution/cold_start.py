@@ -1,7 +1,7 @@
 """Compile before workers start: otherwise each of them would compile the same code, minutes of computing each.
 
 One process per core compiles, one estimator at a time; all of them, and the workers later, share the cache of compiled
-code. Whatever goes wrong here is left to the workers.
+code. Any failure here is left to the workers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ...estimators.interface import Estimator
 from ..experiment.plan import plain
 from .child import Child, start
 
-NOTICE = "compiling the estimators, once on this machine; this takes a minute or two"
+NOTICE = "compiling the estimators, once on this machine: about half a minute on two cores"
 HEAVIEST = ("WindowSmoother", "BatchSmoother", "UnscentedKalmanFilter", "InvariantKalmanFilter")
 """Kinds that take longest to compile, in this order; they go first, so that no core ends with a long one alone."""
 SERVE = f"{__name__}:serve"
@@ -68,7 +68,7 @@ def compile_first(wanted: Iterable[Estimator]) -> None:
                     if said:
                         remember(code)
                     hand_over(child)
-                except (OSError, EOFError):  # the process died; what it left undone is left to the workers
+                except (OSError, EOFError):  # the process died; the workers compile the rest
                     busy.pop(connection, None)
                 progress.done(kind)
 
@@ -84,7 +84,7 @@ def _cores() -> int:
 
 
 class Progress:
-    """What is said of compiling, on standard error, once the first function is compiled.
+    """Reports the progress of compiling on standard error, from the first function on.
 
     Args:
         estimators: how many there are to compile for.
@@ -140,7 +140,7 @@ def serve(connection: Any) -> None:
                 connection.send(function.__name__)
 
         def on_end(self, event: Any) -> None:
-            """Nothing to say."""
+            """Do nothing."""
 
     event.register("numba:compile", Tell())
     while True:
@@ -157,23 +157,23 @@ def serve(connection: Any) -> None:
 
 
 def code_of(estimator: Estimator) -> str:
-    """Return what tells by which compiled code an estimator runs: its kind and options, whatever their numbers."""
+    """Return a key of the compiled code that an estimator needs: its kind and options, without their numbers."""
     options = json.dumps(plain(dataclasses.asdict(cast(Any, estimator))), sort_keys=True)
     return f"{type(estimator).__name__} {re.sub(r'[0-9][0-9.e+-]*', '#', options)}"
 
 
 def warm() -> set[str]:
-    """Return the `code_of` all that has been compiled, into the cache that holds, from the sources as they are."""
+    """Return the `code_of` everything compiled from the present sources into the present cache."""
     file = _stamp()
     return set(file.read_text(encoding="utf-8").splitlines()) if file.is_file() else set()
 
 
 def remember(code: str) -> None:
-    """Add to `warm`; where the cache cannot be written there is nothing to remember."""
+    """Add to `warm`; do nothing if the cache cannot be written."""
     with suppress(OSError), _stamp().open("a", encoding="utf-8") as file:
         file.write(f"{code}\n")
 
 
 def _stamp() -> Path:
-    """Return a file that lies with the compiled code: another for other sources, versions and processors."""
+    """Return the file of `warm`, in the folder of compiled code; it depends on sources, versions and processor."""
     return compiled_folder() / "warm.txt"

@@ -45,7 +45,7 @@ FETCH_S = 60.0
 
 
 def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable[[str], None]) -> Generator[Finished]:
-    """Yield what each task leaves as it ends, from the workers of a Dask cluster.
+    """Yield the result of each task as it ends, from the workers of a Dask cluster.
 
     Args:
         tasks: the runs.
@@ -55,13 +55,13 @@ def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable
         say: called with messages for the user.
 
     Raises:
-        ExperimentError: the extra is missing; the scheduler cannot be reached, or is lost; a worker computes with other
-            versions than this process, by which runs are known.
+        ExperimentError: the extra is missing; the scheduler cannot be reached, or is lost; a worker has other
+            versions than this process, whose versions identify the runs.
     """
     if not tasks:
         return
     with _connected(address, min(jobs or os.cpu_count() or 1, len(tasks)) if address == "local" else jobs) as client:
-        yield from _Crew(client, tasks, say).run()
+        yield from _Cluster(client, tasks, say).run()
 
 
 @contextmanager
@@ -115,8 +115,8 @@ def _scheduler(address: str) -> str:
 
 
 @dataclass(eq=False)
-class _Hand:
-    """A worker of the cluster: what it is asked now, and what it said of itself."""
+class _RemoteWorker:
+    """A worker of the cluster: its present call, and its greeting."""
 
     address: str
     future: Future
@@ -130,15 +130,15 @@ class _Hand:
         return self.greeting is not None and self.task is None and not self.refused
 
 
-class _Crew:
-    """The workers of a cluster, and which task each is at."""
+class _Cluster:
+    """The workers of a cluster, and the task of each."""
 
     def __init__(self, client: Client, tasks: Sequence[Task], say: Callable[[str], None]) -> None:
         self.client, self.say, self.queue = client, say, Queue(tasks)
         self.sweep = uuid4().hex
         self.estimators = sorted({task.run.estimator.name for task in tasks})
         self.ours = greeting(self.estimators)
-        self.hands: dict[str, _Hand] = {}
+        self.workers: dict[str, _RemoteWorker] = {}
         self.answered: SimpleQueue[Future] = SimpleQueue()
         self.lost_with: dict[str, list[str]] = defaultdict(list)
         self.begun = self.waiting = False
@@ -146,16 +146,16 @@ class _Crew:
         self.assembled_by_s = monotonic() + ASSEMBLE_S
 
     def run(self) -> Iterator[Finished]:
-        """Yield what each task leaves as it ends."""
+        """Yield the result of each task as it ends."""
         try:
-            while self.queue or any(hand.task for hand in self.hands.values()):
+            while self.queue or any(worker.task for worker in self.workers.values()):
                 yield from self._look()
                 self._hand_out()
                 yield from self._collect()
         except (OSError, TimeoutError) as error:  # Dask's errors of communication among them
             where = self.client.scheduler.address if self.client.scheduler else "its address"
             raise ExperimentError(
-                f"the scheduler at {where} is lost ({error}); what is finished is kept, the same command does the rest"
+                f"the scheduler at {where} is lost ({error}); finished runs are kept, and the same command continues"
             ) from None
         finally:
             self._dismiss()
@@ -167,13 +167,13 @@ class _Crew:
         workers: Any = self.client.nthreads()
         there = set(workers)
         self.look_at_s = monotonic() + LOOK_S
-        for address in self.hands.keys() - there:
-            yield from self._lost(self.hands.pop(address))
-        for address in there - self.hands.keys():
-            self.hands[address] = _Hand(address, self._ask(address, greet, self.estimators))
-        if not self.hands and not self.waiting:
-            self.say("waiting for workers to join the scheduler (Ctrl-C gives up, and keeps what is finished)")
-        self.waiting = not self.hands
+        for address in self.workers.keys() - there:
+            yield from self._lost(self.workers.pop(address))
+        for address in there - self.workers.keys():
+            self.workers[address] = _RemoteWorker(address, self._ask(address, greet, self.estimators))
+        if not self.workers and not self.waiting:
+            self.say("waiting for workers to join the scheduler (Ctrl-C stops, and keeps finished runs)")
+        self.waiting = not self.workers
 
     def _ask(self, address: str, function: Callable[..., Any], *args: Any) -> Future:
         """Call a function on this worker and no other."""
@@ -184,13 +184,13 @@ class _Crew:
 
     def _hand_out(self) -> None:
         """Give every idle worker a task, once the first workers have said which versions they have."""
-        if not self.begun and monotonic() < self.assembled_by_s and not all(h.greeting for h in self.hands.values()):
+        if not self.begun and monotonic() < self.assembled_by_s and not all(h.greeting for h in self.workers.values()):
             return
-        for hand in self.hands.values():
-            if hand.idle and self.queue:
-                others = [other.last for other in self.hands.values() if other is not hand]
-                hand.task = hand.last = task = self.queue.take(hand.last, others)
-                hand.future = self._ask(hand.address, do, self.sweep, pickle.dumps(task))
+        for worker in self.workers.values():
+            if worker.idle and self.queue:
+                others = [other.last for other in self.workers.values() if other is not worker]
+                worker.task = worker.last = task = self.queue.take(worker.last, others)
+                worker.future = self._ask(worker.address, do, self.sweep, pickle.dumps(task))
                 self.begun = True
 
     def _collect(self) -> Iterator[Finished]:
@@ -199,25 +199,25 @@ class _Crew:
             future = self.answered.get(timeout=LOOK_S)
         except Empty:
             return
-        hand = next((hand for hand in self.hands.values() if hand.future is future), None)
-        if hand is None:  # of a worker that is gone
+        worker = next((worker for worker in self.workers.values() if worker.future is future), None)
+        if worker is None:  # of a worker that is gone
             return
         try:
             answer = future.result(timeout=FETCH_S)
         except Exception as error:
-            yield from self._failed(hand, error)
+            yield from self._failed(worker, error)
             return
         finally:
             future.release()
         if isinstance(answer, Greeting):
-            self._meet(hand, answer)
+            self._meet(worker, answer)
         else:
-            hand.task = None
+            worker.task = None
             yield answer
 
-    def _meet(self, hand: _Hand, answer: Greeting) -> None:
+    def _meet(self, worker: _RemoteWorker, answer: Greeting) -> None:
         """Accept a worker whose versions are those of this process; its rows would otherwise name the wrong ones."""
-        hand.greeting = answer
+        worker.greeting = answer
         mine, theirs = self.ours.versions, answer.versions
         differ = [
             f"{name} {theirs.get(name, 'absent')} there, {mine[name]} here"
@@ -225,55 +225,55 @@ class _Crew:
             if theirs.get(name) != mine[name]
         ]
         if differ:
-            self._refuse(hand, f"{'; '.join(differ)}: install the same there, and start it again")
+            self._refuse(worker, f"{'; '.join(differ)}: install the same there, and start it again")
         elif answer.threads > 1:
             self.say(
-                f"worker {hand.address} has {answer.threads} threads and is given one run at a time; "
+                f"worker {worker.address} has {answer.threads} threads and is given one run at a time; "
                 "start it with --nthreads 1, and more of them"
             )
 
-    def _refuse(self, hand: _Hand, why: str) -> None:
-        hand.refused = True
+    def _refuse(self, worker: _RemoteWorker, why: str) -> None:
+        worker.refused = True
         if not self.begun:
-            raise ExperimentError(f"worker {hand.address} is not like this process: {why}")
-        self.say(f"worker {hand.address} is left out: {why}")
+            raise ExperimentError(f"worker {worker.address} is not like this process: {why}")
+        self.say(f"worker {worker.address} is left out: {why}")
 
-    def _failed(self, hand: _Hand, error: Exception) -> Iterator[Finished]:
+    def _failed(self, worker: _RemoteWorker, error: Exception) -> Iterator[Finished]:
         """Handle an error that Dask reports for a call."""
         from distributed import CancelledError, KilledWorker
 
         if isinstance(error, CancelledError | KilledWorker | OSError | TimeoutError):
-            del self.hands[hand.address]  # if it is still there, it is greeted anew
-            yield from self._lost(hand)
-        elif hand.task is None:
-            hand.greeting = hand.greeting or Greeting({}, {})
-            self._refuse(hand, f"{type(error).__name__}: {error}")
+            del self.workers[worker.address]  # if it is still there, it is greeted anew
+            yield from self._lost(worker)
+        elif worker.task is None:
+            worker.greeting = worker.greeting or Greeting({}, {})
+            self._refuse(worker, f"{type(error).__name__}: {error}")
         else:
-            task, hand.task = hand.task, None
-            yield Finished([task.row("failed", f"{type(error).__name__}: {error}") | _provenance(hand)])
+            task, worker.task = worker.task, None
+            yield Finished([task.row("failed", f"{type(error).__name__}: {error}") | _provenance(worker)])
 
-    def _lost(self, hand: _Hand) -> Iterator[Finished]:
+    def _lost(self, worker: _RemoteWorker) -> Iterator[Finished]:
         """Put back the task of a lost worker, unless it has lost TRIES workers."""
-        self.client.cancel([hand.future], force=True)
-        task = hand.task
+        self.client.cancel([worker.future], force=True)
+        task = worker.task
         if task is None:
             return
         lost = self.lost_with[task.identity]
-        lost.append(hand.address)
+        lost.append(worker.address)
         if len(lost) < TRIES:
             self.queue.put_back(task)
-            self.say(f"worker {hand.address} is gone; {task.run} is tried again")
+            self.say(f"worker {worker.address} is gone; {task.run} is tried again")
         else:
             cause = f"its worker was lost {TRIES} times ({', '.join(lost)}): killed, out of memory, or out of reach"
-            yield Finished([task.row("failed", cause) | _provenance(hand)])
+            yield Finished([task.row("failed", cause) | _provenance(worker)])
 
     def _dismiss(self) -> None:
         """Cancel all tasks at the scheduler and end the processes on the workers."""
         with suppress(OSError, TimeoutError, RuntimeError):
-            self.client.cancel([hand.future for hand in self.hands.values()], force=True)
-            self.client.run(dismiss, self.sweep, workers=list(self.hands), on_error="ignore")
-        self.hands.clear()
+            self.client.cancel([worker.future for worker in self.workers.values()], force=True)
+            self.client.run(dismiss, self.sweep, workers=list(self.workers), on_error="ignore")
+        self.workers.clear()
 
 
-def _provenance(hand: _Hand) -> dict[str, str]:
-    return hand.greeting.provenance if hand.greeting else {}
+def _provenance(worker: _RemoteWorker) -> dict[str, str]:
+    return worker.greeting.provenance if worker.greeting else {}

@@ -1,4 +1,4 @@
-"""What runs on a worker of a Dask cluster: one run at a time, in a process like a local worker's.
+"""The worker's side of a Dask cluster: one run at a time, in a process like a local worker's.
 
 The run has a process of its own, because Dask's process must answer the scheduler: GTSAM holds Python's lock through
 long calls, and a worker that is silent for minutes counts as dead. The process also keeps Dask's work out of the
@@ -39,7 +39,7 @@ class Greeting:
     threads: int = 1
 
 
-class _Held:
+class _SweepWorker:
     """The process for the runs of one sweep, which keeps logs and compiled code from one run to the next."""
 
     lock = threading.Lock()
@@ -65,17 +65,17 @@ def greeting(estimators: Sequence[str]) -> Greeting:
 
 
 def do(sweep: str, task: bytes) -> Finished:
-    """Do a pickled task in the process that this worker keeps for the sweep, and return what it leaves.
+    """Do a pickled task in the process that this worker keeps for the sweep, and return its result.
 
-    Where recordings are is this worker's affair: the task's folder if there is such a one here, else FATHOM_DATA.
+    Recordings are read from the task's folder if it exists on this machine, else from FATHOM_DATA.
     """
     from .pool import Worker
 
-    with _Held.lock:  # one run at a time even with several threads, or timings would be wrong
-        if _Held.worker is None or _Held.sweep != sweep:
+    with _SweepWorker.lock:  # one run at a time even with several threads, or timings would be wrong
+        if _SweepWorker.worker is None or _SweepWorker.sweep != sweep:
             _let_go()
-            _Held.worker, _Held.sweep = Worker(), sweep
-        worker = _Held.worker
+            _SweepWorker.worker, _SweepWorker.sweep = Worker(), sweep
+        worker = _SweepWorker.worker
         worker.begin(_with_data_here(pickle.loads(task)))
         wait([worker.child.connection], max(0.0, worker.give_up_s - monotonic()))
         finished = worker.collect()
@@ -85,22 +85,22 @@ def do(sweep: str, task: bytes) -> Finished:
 
 
 def dismiss(sweep: str) -> None:
-    """End the sweep's process, and the run that it is at."""
-    worker = _Held.worker
-    if worker is None or _Held.sweep != sweep:
+    """End the sweep's process, and the run in it."""
+    worker = _SweepWorker.worker
+    if worker is None or _SweepWorker.sweep != sweep:
         return
-    worker.child.process.kill()  # a `do` that waits for it ends, and lets go of it
-    if _Held.lock.acquire(blocking=False):
+    worker.child.process.kill()  # a `do` that waits for it ends, and forgets it
+    if _SweepWorker.lock.acquire(blocking=False):
         try:
             _let_go()
         finally:
-            _Held.lock.release()
+            _SweepWorker.lock.release()
 
 
 def _let_go() -> None:
-    if _Held.worker is not None:
-        _Held.worker.child.kill()
-        _Held.worker = None
+    if _SweepWorker.worker is not None:
+        _SweepWorker.worker.child.kill()
+        _SweepWorker.worker = None
 
 
 def _with_data_here(task: Task) -> Task:

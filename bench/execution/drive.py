@@ -31,7 +31,7 @@ ON_TIME_NS = 1_000_000
 
 
 class Ending(NamedTuple):
-    """How a run ended, and when; t_ns is None for one that came to its end."""
+    """How a run ended, and when; t_ns is None if it reached the end of the log."""
 
     status: Status
     cause: str | None = None
@@ -54,7 +54,7 @@ class Recorder:
         """Add a belief.
 
         Raises:
-            Diverged: it is not finite, is off this planet, or has no covariance although the first one had.
+            Diverged: it is not finite, is farther than LOST_M away, or has no covariance although the first one had.
             ValueError: its time is not t_ns.
         """
         _check_time(belief, t_ns)
@@ -102,7 +102,7 @@ class NisCollector:
         return bool(on_time.any())
 
     def judge(self, belief: Belief, epoch: Epoch) -> None:
-        """Take the innovations of the epoch's readings, given the belief at its time that has not seen them.
+        """Add the innovations of the epoch's readings, given the belief at its time before them.
 
         Raises:
             ValueError: the belief is for another time.
@@ -116,7 +116,7 @@ class NisCollector:
         self._tables.append(table[defined])
 
     def table(self) -> NDArray[Any]:
-        """Return all that was taken, as INNOVATION rows."""
+        """Return all innovations, as INNOVATION rows."""
         return np.concatenate([np.zeros(0, INNOVATION), *self._tables])
 
     @staticmethod
@@ -140,7 +140,7 @@ def run_log(
 ) -> Result:
     """Drive an estimator through a log, in the order of reception.
 
-    Whatever the estimator raises ends the run, not the caller; only KeyboardInterrupt and its like pass through.
+    Any exception of the estimator ends the run, not the caller; KeyboardInterrupt and the like pass through.
 
     Args:
         log: where it states no prior, `initialise` makes one.
@@ -151,8 +151,8 @@ def run_log(
         nis: judge the estimator by its innovations. It then gets each epoch in two halves, first the motion without
             readings, then the readings without motion, and is asked for its belief in between. A step's time is that of
             both halves; the belief is not charged, but what it leaves computed may make a smoother's next step cheaper.
-            What is said stays the same, but for a graph smoother with late readings: asked for a belief, it takes their
-            factors in at once and not with its next keyframe.
+            The estimates stay the same, except for a graph smoother with late readings: asked for a belief, it adds
+            their factors at once and not with its next keyframe.
 
     Raises:
         DatasetError: no prior can be made for the log.
@@ -242,14 +242,14 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
 
 
 def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | None, int, Ending]:
-    """Return (hindsight, time it took, ending); a run that had ended early keeps its own cause."""
+    """Return (smoothed trajectory, time it took, ending); a run that had ended early keeps its own cause."""
     started = perf_counter_ns()
     smoothed = None
     try:
         smoothed = run.finish()
         if smoothed is not None and not (np.abs(smoothed.p_WB_W).max(initial=0.0) < LOST_M):  # nor NaN
             smoothed = None
-            raise Diverged("the state with hindsight is not finite, or off this planet")
+            raise Diverged("the smoothed state is not finite, or far beyond the Earth's surface")
     except Exception as error:
         if ending.status == "done":
             lost = isinstance(error, Diverged)
@@ -259,13 +259,13 @@ def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | Non
 
 
 def _describe(error: Exception) -> str:
-    """Name the type and what it says, on one line."""
+    """Return type and message of an error, on one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @contextmanager
 def _collector_off() -> Iterator[None]:
-    """Keep Python's garbage collector from landing in somebody's step."""
+    """Keep Python's garbage collector out of the timed steps."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -278,8 +278,8 @@ def _collector_off() -> Iterator[None]:
 def score_ticks(log: Log, period_s: float) -> TimeArray:
     """Return the times at which beliefs are asked for, (k,) ns.
 
-    With truth they are its own stamps, so that nobody interpolates: the nearest to each point of a regular grid that
-    begins one period after the start. Without, or where it is empty, a regular grid from the start.
+    With ground truth they are its own stamps, so that nothing is interpolated: the nearest to each point of a
+    regular grid that begins one period after the start. Without it, or if it is empty, a regular grid from the start.
     """
     period_ns = int(period_s * 1e9)
     if log.truth is None or len(log.truth) == 0:

@@ -59,7 +59,7 @@ def log_of(task: Task) -> LogName:
 
 @dataclass(eq=False)
 class Worker:
-    """One process, with the task it is at, and the last it was at."""
+    """One process, with its present task and its last one."""
 
     child: Child = field(default_factory=lambda: start(f"{__package__}.worker:work"))
     task: Task | None = None
@@ -74,9 +74,9 @@ class Worker:
             self.child.connection.send(task)
 
     def collect(self) -> Finished:
-        """Return what the task left, once the connection is ready or time is out.
+        """Return the result of the task, once the connection is ready or time is out.
 
-        The task stays with the worker where that is lost, and is to be killed.
+        If the worker is lost it keeps its task, and must be killed.
         """
         task = self.task
         assert task is not None
@@ -93,9 +93,9 @@ class Worker:
 
 
 def run_all(tasks: Sequence[Task], jobs: int = 0) -> Generator[Finished]:
-    """Yield what each task leaves as it ends, from `jobs` worker processes (0: one per core).
+    """Yield the result of each task as it ends, from `jobs` worker processes (0: one per core).
 
-    Each worker has one task at a time, so a death is that task's, and is made good by a fresh worker.
+    Each worker has one task at a time, so if it dies, only that task fails, and a new worker replaces it.
     """
     queue = Queue(tasks)
     workers = [Worker() for _ in range(min(jobs or os.cpu_count() or 1, len(tasks)))]

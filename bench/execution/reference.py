@@ -36,7 +36,7 @@ SHORT = {
 """What a mission has at most of each, so that it still goes down, turns and comes up; outages keep their share."""
 
 SHORT_SEEDS = {"relinearisation": 1, "delays": 1, "cost": 1}
-"""How many of an experiment's seeds, the first ones; two where nothing is said."""
+"""How many of an experiment's seeds, the first ones; two if not listed."""
 
 LEFT_OUT = {
     "delays": ("fls-batch lag 3", "isam2", "batch"),
@@ -60,7 +60,7 @@ COLUMNS = {
     "heading_rmse_deg": "°",
     "drift_end_percent": "%",
     "rpe_rmse_m": "m",
-    "nees_position": "3 when honest",
+    "nees_position": "3 if consistent",
     "floor_position_m": "m",
     "nis_dvl": "",
     "nis_depth": "",
@@ -117,7 +117,7 @@ def short_rows(name: str, data: Path | None = None, chosen: Callable[[Run], bool
 
 
 def reference_table(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return what a reference table holds of rows; a column that nobody has a number in is left out."""
+    """Return the reference table of rows; a column without any number is left out."""
     every = groups(records(rows), "log", "label", "output")
     full = [record | _extremes(every[record["log"], record["label"], record["output"]]) for record in summarise(rows)]
     return pd.DataFrame(full, columns=list(COLUMNS)).dropna(axis="columns", how="all")

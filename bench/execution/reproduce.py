@@ -135,7 +135,7 @@ def _remarks(stored: Stored, task: Task) -> Iterator[str]:
         if key == "log_sha256" and then.get(key) != now.get(key):
             yield f"the description of {task.run.log.log} (its log.yaml, or the catalog's entry) has changed since"
         elif key not in then:
-            yield f"its spec does not tell {key}; it was run with today's default, {now[key]!r}"
+            yield f"its spec lacks {key}; it was run with today's default, {now[key]!r}"
         elif then[key] != now.get(key):
             yield f"its spec says {key}: {then[key]!r}, which was taken for {now.get(key)!r}"
     made_by = json.loads(stored.first["versions"] or "{}")
@@ -143,7 +143,7 @@ def _remarks(stored: Stored, task: Task) -> Iterator[str]:
     if stored.first["identity"] not in (None, identity(stored.spec, package, task.readings_sha256, made_by)):
         which = "the readings" if task.readings_sha256 else "its spec or versions, as the store has them,"
         which += f" or the version of {package.rpartition(' ')[0]}, now {package}," if package else ""
-        yield f"{which} cannot be what it was made from: its identity is another"
+        yield f"{which} must have changed: the identity differs"
 
 
 def _flat(value: Any, path: str = "") -> dict[str, Any]:

@@ -27,7 +27,7 @@ class Result:
         cause: why it is not done, in a sentence.
         failed_at_s: when, from the start of the log.
         online: the beliefs at the ticks, with no delay; None where it never came to the first tick.
-        smoothed: the same states with hindsight; None where the estimator has none.
+        smoothed: the smoothed states; None where the estimator has none.
         step_ns: (epochs,) time of each `step`.
         belief_ns: (ticks,) time of each `belief`.
         finish_ns: time of `finish`.

@@ -1,4 +1,4 @@
-"""Run an experiment: what is missing in the store, and every finished run into the store at once."""
+"""Run an experiment: runs that the store lacks, each stored as soon as it is finished."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ LINE_EVERY_S = 10.0
 
 
 class Outcome(NamedTuple):
-    """What a sweep left in the store.
+    """The result of a sweep.
 
     Attributes:
         rows: of the store, one per run and output.
-        standing: how many runs were in the store already.
-        renewed: how many stood there under another identity and were run anew.
-        kept: why a log did not run whose rows of an earlier day are kept, by its name.
+        standing: number of runs that were in the store already.
+        renewed: number of runs that were there under another identity and were repeated.
+        kept: by a log's name, why it did not run; its earlier rows are kept.
     """
 
     rows: pd.DataFrame
@@ -76,20 +76,20 @@ def sweep(
     dask: str | None = None,
     finished_log: Callable[[pd.DataFrame], None] | None = None,
 ) -> Outcome:
-    """Run what is missing in the store, and say what is there afterwards.
+    """Run what the store lacks, and return its rows.
 
     A run that is in the store under its `identity` is not run again. A run that fails, diverges, or kills its worker is
     a row that says so. Interrupted (KeyboardInterrupt), the finished runs are in the store. A run whose recording is
-    not here keeps the rows of an earlier day.
+    missing keeps its earlier rows.
 
     Args:
         experiment: an experiment, a shipped one's name, or a YAML file.
         data: where recorded logs are; else FATHOM_DATA.
         out: the rows go to out/<experiment>/runs.sqlite, the trajectories beside it.
-        jobs: worker processes; 0 for one per core. The workers of a cluster elsewhere are its own affair.
+        jobs: worker processes; 0 for one per core. Not for a cluster elsewhere, which has its own workers.
         only: run only what matches this pattern: an estimator's label, a log's name, or "log/label".
         repair: let loaders drop bad rows, and count them.
-        force: run what is in the store already, too.
+        force: repeat runs that are in the store already.
         dask: address of a Dask scheduler, its scheduler file, or "local", see `dask_pool`; else worker processes here.
         finished_log: called with the rows of a log as soon as the last of its runs has ended.
 
@@ -150,7 +150,7 @@ def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[T
 
 
 def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Task], int]:
-    """Return the tasks that are not in the store yet, and how many of them stand there under another identity."""
+    """Return the tasks that are not in the store yet, and how many of them are there under another identity."""
     finished = store.finished()
     named = {key[:3] for key in finished}
     missing, renewed = [], 0
@@ -164,7 +164,7 @@ def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Tas
 
 
 def _sweep(folder: Path, spoken_of: set[str]) -> None:
-    """Remove what runs that were killed or made anew left behind."""
+    """Remove the files of runs that were killed or repeated."""
     for path in folder.iterdir():
         if path.name not in spoken_of and (path.suffix == ".parquet" or ".parquet." in path.name):
             path.unlink(missing_ok=True)
@@ -174,7 +174,7 @@ def _make_room(folder: Path) -> None:
     """Make the folders of the results, before anything runs.
 
     Raises:
-        ExperimentError: they cannot be made, or something else is where a result will go.
+        ExperimentError: they cannot be made, or something else is at a result's path.
     """
     for path in (folder / "trajectories", folder / "figures"):  # the lock lies in their parent
         try:
@@ -201,7 +201,7 @@ def _select(experiment: Experiment, only: str | None) -> list[Run]:
 
 
 def _opened(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]], dict[str, float]]:
-    """Open each recorded log once, so that bad input ends everything before a run begins.
+    """Open each recorded log once, so that bad input is refused before any run begins.
 
     Returns the tasks whose log is here, a row for each of the others, and how long each log is, s.
     """
@@ -239,7 +239,7 @@ def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
-    """Return which of the rows `rows_of` gave were made under another spec or version than a run today would be."""
+    """Return which of the rows `rows_of` gave were made with another spec or version than the present one."""
     runs = {(run.log.name, run.estimator.label, run.seed): run for run in experiment.runs()}
     versions = json.loads(provenance()["versions"])
 

@@ -70,7 +70,7 @@ class Task:
         return identity(self.spec, package_of(self.run.estimator.name), self.readings_sha256)
 
     def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
-        """Return what a row says whether the run succeeds or not."""
+        """Return the columns of a row that do not depend on success."""
         run = self.run
         return {
             "experiment": self.experiment,
@@ -122,8 +122,8 @@ class Finished:
 def file_name(task: Task, output: str, content: str) -> str:
     """Return the name of a trajectory's file.
 
-    It ends in the identity of the run (of the content, for the truth, which runs share): so a file is never written
-    over with another's content, and a row that stands keeps its own.
+    It ends in the identity of the run (of the content, for the truth, which runs share): so no file is
+    overwritten with other content, and the rows in the store keep their files.
     """
     label = task.run.estimator.label if output != "truth" else ""
     seed = "" if task.run.seed is None else str(task.run.seed)
@@ -141,7 +141,7 @@ def parquet(trajectory: Trajectory) -> bytes:
         for j in range(i, 15):
             values = columns.pop(f"P_{i}_{j}", None)
             if values is not None and i // 3 == j // 3:
-                with np.errstate(over="ignore"):  # a covariance on its way to infinity may get there
+                with np.errstate(over="ignore"):  # a covariance that diverges may overflow
                     columns[f"P_{i}_{j}"] = values.astype(np.float32)
     buffer = pa.BufferOutputStream()
     write_table(pa.table(columns), buffer, use_dictionary=False, write_statistics=False)

@@ -32,7 +32,7 @@ from .result import Result, costs, innovation_dof, innovation_scores
 from .task import Finished, Task, file_name, parquet
 
 LOGS_KEPT = 2
-"""How many logs a worker keeps in memory, so that estimators share them: the one it is at, and one taken over."""
+"""How many logs a worker keeps in memory, so that estimators share them: the present one and the one before."""
 
 
 def work(connection: Connection) -> None:
@@ -46,7 +46,7 @@ def work(connection: Connection) -> None:
 
 
 class WorkerCache:
-    """What a worker keeps from one task to the next: the last logs, their floors and truths, and what is compiled."""
+    """Kept by a worker between tasks: the last logs, their floors and truths, and compiled estimators."""
 
     def __init__(self) -> None:
         self.logs: OrderedDict[str, Log] = OrderedDict()
@@ -95,7 +95,7 @@ class WorkerCache:
             warm_up(estimator)
             self.warm.add(repr(estimator))
             gc.collect()
-            gc.freeze()  # what imports and compiling made stays: no later collection walks through it again
+            gc.freeze()  # imports and compiled code stay: later collections skip them
         return estimator
 
     def floor(self, task: Task, result: Result, lookahead_s: float) -> dict[str, float | None]:
@@ -181,13 +181,13 @@ def open_same(task: Task) -> Log:
 class _PeakMemory:
     """Peak of resident memory inside the block, less that at its start, MB; None where the system does not report it.
 
-    Memory that earlier runs left is given back before, or the peak would hide in it.
+    Memory of earlier runs is released before, since it would hide the peak.
     """
 
     def __enter__(self) -> _PeakMemory:
         self.peak_mb: float | None = None
         gc.collect()
-        with suppress(AttributeError, OSError):  # glibc's; or this run would hide in what earlier ones left
+        with suppress(AttributeError, OSError):  # glibc's; otherwise memory of earlier runs would hide the peak
             ctypes.CDLL(None).malloc_trim(0)
         try:
             Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak restarts from here

@@ -1,1 +1,1 @@
-"""What is asked: an experiment file, its variants, and which results are compared."""
+"""Experiments: their files, plans, variants and comparisons."""

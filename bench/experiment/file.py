@@ -1,4 +1,4 @@
-"""An experiment as its YAML file says it: entries that may each stand for many logs or estimators."""
+"""The content of an experiment file: entries, each of which may stand for many logs or estimators."""
 
 from __future__ import annotations
 
@@ -156,13 +156,13 @@ def _can_be_compared(scores: tuple[str, ...]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, config=STRICT)
-class Sides:
-    """What `fathom tune` may look at: patterns of a log's name, or of "log/seed".
+class SplitPatterns:
+    """Which runs `fathom tune` trains on, and which it holds out: patterns of a log's name, or of "log/seed".
 
     Attributes:
-        train: what the search sees; without patterns, all that is not held out.
-        held_out: what it never sees; without patterns, all that does not train. Without either, of simulated logs the
-            first half of the seeds trains and the rest is held out, and recorded logs take no part.
+        train: runs for the search; without patterns, all that are not held out.
+        held_out: runs for the final check; without patterns, all that are not in training. Without either, the first
+            half of the seeds of simulated logs is for training and the rest is held out; recorded logs are not used.
     """
 
     train: tuple[str, ...] = ()
@@ -171,7 +171,7 @@ class Sides:
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class Settings:
-    """What an experiment says once for all its runs.
+    """Settings of an experiment that hold for all its runs.
 
     Attributes:
         name: its folder under `results`.
@@ -199,7 +199,7 @@ class Settings:
         "heading_rmse_deg",
         "velocity_rmse_m_s",
     )
-    tune: Sides = Sides()
+    tune: SplitPatterns = SplitPatterns()
     max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0
 

@@ -1,4 +1,4 @@
-"""The experiments that come with Fathom, found without all that it takes to read one."""
+"""The experiments that come with Fathom: names and files, without importing what reads them."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from ...datasets.errors import complaints, nearest
 from ..errors import ExperimentError
 from ..metrics.comparison import Comparison
 from ..metrics.scoring import Scoring
-from .file import STRICT, ExperimentFile, Settings, Sides, refuse_twice, refuse_unknown
+from .file import STRICT, ExperimentFile, Settings, SplitPatterns, refuse_twice, refuse_unknown
 from .packaged import shipped_experiments
 from .specs import EstimatorSpec, LogSpec, Run, plain
 
@@ -25,7 +25,7 @@ __all__ = [
     "Experiment",
     "LogSpec",
     "Run",
-    "Sides",
+    "SplitPatterns",
     "find_experiment",
     "plain",
     "shipped_experiments",
@@ -134,7 +134,7 @@ class Experiment(Settings):
 
 
 def find_experiment(name_or_path: str | Path) -> Path:
-    """Return the YAML file of a shipped experiment, or the path as it stands.
+    """Return the YAML file of a shipped experiment, or the path unchanged.
 
     Raises:
         ExperimentError: neither a shipped name nor a file.

@@ -1,4 +1,4 @@
-"""What one run is made of: a log and an estimator with every default filled in, and a seed."""
+"""The specs of a run: a log and an estimator with every default filled in, and a seed."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class LogSpec:
 
     @property
     def path_sha256(self) -> str | None:
-        """Of the recorded path that a simulated log follows; None where there is none, or it cannot be read."""
+        """Of the recorded path that a simulated log follows; None if it follows none, or the file cannot be read."""
         path = Scenario.from_dict(self.scenario or {}).path if self.scenario is not None else None
         try:
             return None if path is None else sha256(Path(path).read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Grids: one entry of an experiment that stands for many, a field or several being changed from one to the next.
+"""Grids: the variants of an entry of an experiment, over values of one or more fields.
 
 grid: {lag_s: [1, 3, 10], gate.gps: [0.99, 0.999]}        six variants, "… lag_s=1 gate.gps=0.99" first
 grid: {dvl: {velocity: [velocity], loose: [preintegrated-loose]}}       two, named "… velocity" and "… loose"

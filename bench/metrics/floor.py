@@ -1,6 +1,6 @@
-"""The floor: what the best of estimators could know, with no delay, after a lag, and after the whole log.
+"""The floor of estimation errors: online, at a lag, and over the whole log.
 
-It is the posterior Cramér–Rao bound: no estimator's error covariance is less, whatever its method. Motion and readings
+It is the posterior Cramér–Rao bound: no estimator's error covariance is less, by any method. Motion and readings
 are linearised at the truth, with the noise that is truly in them. Between two moments j − 1 and j of the voyage
 
     P⁻ = F P Fᵀ + Q                                                 F, Q: the IMU block between them

@@ -1,1 +1,1 @@
-"""What people see: tables, figures and the report."""
+"""Output: tables, figures and the report."""

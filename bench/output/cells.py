@@ -1,4 +1,4 @@
-"""What all tables and figures share: columns, how a value becomes text, and the words for outputs, lags and axes.
+"""Shared by all tables and figures: columns, how a value becomes text, and the words for outputs, lags and axes.
 
 The terminal, LaTeX, the report and the figures lay out what stands here; none of them names or formats a score itself.
 """

@@ -1,4 +1,4 @@
-"""What `fathom run` prints, and writes beside the store: tables as runs finish, figures and report at the end."""
+"""Output of `fathom run`, on the terminal and in files: tables as runs finish, figures and report at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reader must know beside the numbers: runs that did not finish, and results not to be trusted; a line each."""
+"""Remarks on the numbers: runs that did not finish, and results not to be trusted; a line each."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What runs leave: the store, the identity of a run, summaries, intervals and paired differences."""
+"""Results of runs: the store, the identity of a run, summaries, intervals and paired differences."""

@@ -1,4 +1,4 @@
-"""The identity of a run: a hash of all that decides its numbers.
+"""The identity of a run: a hash of everything that its numbers depend on.
 
 That is its spec with every default, the readings of a recorded log, the sources of this package, and the versions of
 what it computes with. A run that is in the store under its identity is not repeated; a changed spec or version makes
@@ -21,7 +21,7 @@ import numpy as np
 
 COMPUTES_WITH = ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas")
 FINAL = ("done", "diverged")
-"""Runs that ended so are not repeated; a failed one (its worker died, it was out of time) is."""
+"""Statuses of runs that are not repeated; a failed one (its worker died, it was out of time) is."""
 
 
 @cache
@@ -42,7 +42,7 @@ def code_sha256() -> str:
     digest = sha256()
     for package in ("bench", "datasets", "estimators"):
         sources = sorted((Path(__file__).parents[2] / package).rglob("*.py"))
-        for path in (path for path in sources if "__pycache__" not in path.parts):  # a profile's wrappers lie there
+        for path in (path for path in sources if "__pycache__" not in path.parts):  # it may hold wrappers of a profile
             digest.update(
                 f"{package}/{path.as_posix().rpartition(f'/{package}/')[2]}".encode()
                 + sha256(path.read_bytes()).digest()
@@ -91,7 +91,7 @@ def identity(
         package: name and version of the package that the estimator comes from; None for ours.
         readings_sha256: of a recorded log, or of the recorded path that a simulated one follows; None for any other,
             which its spec determines.
-        made_by: `versions` of an earlier day, for the identity that the run would have had then; today's without.
+        made_by: earlier `versions`, for the identity that the run had with them; default: the present ones.
     """
     decides = {"spec": spec, "readings": readings_sha256, "versions": made_by or versions(), "package": package}
     return sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()

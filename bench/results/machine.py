@@ -2,7 +2,7 @@
 
 The same versions give the same bits where these facts are the same: the kind of processor, for which numba compiles and
 by which OpenBLAS, numpy and the C library choose among their kernels (fused or not, sums of four or of eight); and
-the C library itself, whose sine is not everybody's. What a library was built with stands in its version.
+the C library itself, whose sine may differ. How a library was built is part of its version.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 DECIDES = ("cpu", "architecture", "c_library", "compiled_for", "simd", "blas")
-"""The keys of `machine` that decide; the rest (cores, platform, node) are for people."""
+"""The keys of `machine` that affect rounding; the rest (cores, platform, node) is for information."""
 
 CHOOSES = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "GLIBC_TUNABLES")
 """Variables of the environment by which a user chooses other kernels than the processor asks for."""

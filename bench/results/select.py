@@ -1,4 +1,4 @@
-"""The runs of a store, by the names that people call them, and what they were made with."""
+"""Selection of the runs of a store by log, label, seed or identity."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Stored:
     """One run of a store.
 
     Attributes:
-        rows: what it left, a row per output.
+        rows: one per output.
     """
 
     rows: tuple[Record, ...]
 
     @property
     def first(self) -> Record:
-        """The row that speaks for all outputs in what they share."""
+        """The first row; columns of the run are the same in all."""
         return self.rows[0]
 
     @property
@@ -47,7 +47,7 @@ class Stored:
 
     @cached_property
     def spec(self) -> dict[str, Any]:
-        """All that decided the run's numbers but readings and versions."""
+        """Everything that the run's numbers depend on, except readings and versions."""
         return json.loads(self.first["spec"] or "{}")
 
     @cached_property

@@ -23,7 +23,7 @@ from .machine import machine
 Row = Mapping[str, Any]
 
 NAMES = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER", "output": "TEXT"}
-"""What a row is called: seed is NULL for a recorded log; output is "online" or "smoothed"."""
+"""Columns that name a row: seed is NULL for a recorded log; output is "online" or "smoothed"."""
 
 OUTCOME = {
     "status": "TEXT",  # done, diverged, failed, absent
@@ -113,7 +113,7 @@ class Store:
             raise ExperimentError(f"{self.path}: cannot write ({error}); the runs before are kept") from None
 
     def write_absent(self, row: Row) -> bool:
-        """Add the row of a run that could not be made; return False, and do nothing, where an earlier one left rows."""
+        """Add the row of a run that could not be made; do nothing and return False if it has earlier rows."""
         run = {key: row[key] for key in NAMES}
         found = self.connection.execute(f"SELECT 1 FROM runs WHERE {SAME_RUN} AND status IS NOT 'absent'", run)
         if found.fetchone():
@@ -128,7 +128,7 @@ class Store:
         return set(self.connection.execute(query))
 
     def trajectories(self) -> set[str]:
-        """Return the names of the trajectory files that rows speak of."""
+        """Return the names of the trajectory files that rows refer to."""
         query = "SELECT trajectory FROM runs UNION SELECT truth_trajectory FROM runs"
         return {name for (name,) in self.connection.execute(query) if name is not None}
 
@@ -137,7 +137,7 @@ class Store:
         return read_rows(self.connection, log)
 
     def close(self) -> None:
-        """Fold the write-ahead log into the file and let go of it."""
+        """Merge the write-ahead log into the file and close it."""
         self.connection.close()
 
     def __enter__(self) -> Store:

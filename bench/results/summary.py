@@ -24,7 +24,7 @@ Record: TypeAlias = dict[str, Any]
 
 SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
 SEEDS_ENOUGH = 5
-"""With fewer seeds the interval of ANEES is so wide that only NIS, where it was asked for, is worth a table."""
+"""With fewer seeds the interval of ANEES is too wide to be useful, so only NIS, if requested, is tabulated."""
 
 COUNTS = {
     "readings": ("readings",),
@@ -32,7 +32,7 @@ COUNTS = {
     "late_dropped": ("late",),
     "carried": ("carried",),
 }
-"""What estimators did with readings that came late or between keyframes; summed over seeds."""
+"""Counts of readings that were late or between keyframes; summed over seeds."""
 
 UNFINISHED = ("diverged", "failed", "absent")
 """How a run ends that does not finish."""

@@ -1,4 +1,4 @@
-"""What is timed: small pieces of real work, by name and group.
+"""The benchmarks: small pieces of real work, by name and group.
 
 `pytest tests/bench/timing` times these. `fathom timing against REV` compares them with those of another revision: it
 loads this file into the packages of both revisions, so both do the same work. The modules of a revision may lie

@@ -1,4 +1,4 @@
-"""The budgets of the design, section 8: what is measured for each row, and what is asked for."""
+"""The budgets of speed and memory: the measurement and the limit of each row."""
 
 from __future__ import annotations
 

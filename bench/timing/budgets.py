@@ -1,4 +1,4 @@
-"""A budget is a number that must not be exceeded, or not be fallen short of; `fathom timing budgets` measures them.
+"""Budgets, numbers that must not be exceeded or fallen short of, and `fathom timing budgets`, which measures them.
 
 Nearly all are ratios, both sides measured within one command and taking turns. Where both sides are one thread of ours,
 processor time is compared, so that a busy machine does not matter much. The rows stand in `budget_rows`.
@@ -34,10 +34,10 @@ class Measured:
 
 @dataclass(frozen=True)
 class Budget:
-    """One row of section 8 of the design.
+    """One row of the table of budgets.
 
     Attributes:
-        name: what is measured, over what.
+        name: numerator and denominator.
         limit: the number asked for.
         least: whether it is the least allowed (else the most).
         measure: measures it.

@@ -1,4 +1,4 @@
-"""What compiling costs from nothing: processor time and number of compilations, by estimator."""
+"""Cost of compiling with an empty cache: processor time and number of compilations, by estimator."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class Stopwatch:
 
 @contextmanager
 def stopwatch() -> Iterator[Stopwatch]:
-    """Start a process to time runs in; it is gone afterwards."""
+    """Start a process to time runs in; it is ended afterwards."""
     with start(f"{__name__}:serve") as child:
         yield Stopwatch(child.connection)
 
@@ -121,7 +121,7 @@ def stopwatch() -> Iterator[Stopwatch]:
 
 
 def serve(connection: Any) -> None:
-    """Answer for as long as there is anybody who asks."""
+    """Answer until the connection closes."""
     while True:
         try:
             log, estimator, stages = connection.recv()

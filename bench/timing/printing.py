@@ -1,4 +1,4 @@
-"""What the verbs of `fathom timing` share: progress, selection by pattern, a JSON file, the machine in words."""
+"""Shared by the verbs of `fathom timing`: progress, selection by pattern, a JSON file, the machine in words."""
 
 from __future__ import annotations
 

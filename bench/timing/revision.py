@@ -98,7 +98,7 @@ class Worker:
             return self.child.connection.recv()
         except (EOFError, OSError):
             code = self.child.process.wait()
-            raise TimingError(f"{self.name}: its process died (exit code {code}); its last words are above") from None
+            raise TimingError(f"{self.name}: its process died (exit code {code}); its output is above") from None
 
     def ask(self, **command: Any) -> dict[str, Any]:
         """Send a command and return the answer."""
@@ -108,7 +108,7 @@ class Worker:
 
 @contextmanager
 def started(*sides: Side) -> Iterator[list[Worker]]:
-    """Start a process of each side; they are gone afterwards."""
+    """Start a process of each side; they are ended afterwards."""
     with ExitStack() as stack:
         workers = []
         for side in sides:
@@ -129,7 +129,7 @@ def working_tree() -> Tree:
 
 @contextmanager
 def checked_out(revision: str, folder: Path) -> Iterator[Tree]:
-    """Check a revision out as a worktree within `folder`, a temporary one; it is removed afterwards, whatever happens.
+    """Check a revision out as a worktree within `folder`, a temporary one; it is always removed afterwards.
 
     Raises:
         TimingError: there is no such revision, or its dependencies cannot be installed.

@@ -1,4 +1,4 @@
-"""What a run costs beyond its work, and what finished runs cost when the same command is given again."""
+"""Overhead of a run beyond its work, and cost of repeating the command when all runs are finished."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ..results.store import Store
 from .budgets import Measured
 
 FINISHED = 20_000
-"""Runs of a large experiment, of which nothing is left to do."""
+"""Number of runs of a large experiment that is finished."""
 WORK_S = 0.4
 """Processor time of simulating and running in each round: enough for the clock, and for what happens now and then."""
 ROUNDS = 5

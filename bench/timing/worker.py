@@ -25,14 +25,14 @@ def load(packages: Path, benchmarks: Path) -> dict[str, Any]:
     assert spec.loader is not None
     module = sys.modules[HOME] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    import fathom.bench  # the one in `packages`, whatever else is installed
+    import fathom.bench  # the one in `packages`, even if another is installed
 
     assert Path(fathom.bench.__path__[0]).parents[1] == packages, fathom.bench.__path__
     return {each.name: each for each in module.BENCHMARKS}
 
 
 def main(connection: Any, packages: str, benchmarks: str, inputs: str) -> None:
-    """Answer commands for as long as there is anybody who asks."""
+    """Answer commands until the connection closes."""
     known = load(Path(packages), Path(benchmarks))
     ready: dict[str, Any] = {}
     gc.disable()
@@ -47,7 +47,7 @@ def main(connection: Any, packages: str, benchmarks: str, inputs: str) -> None:
                 ready[name] = known[name].prepare(Path(inputs))
                 ready[name].do()
                 answer = {"units": ready[name].units} | timed(ready[name].do, 1)
-            except Exception as error:  # whatever a revision lacks, or does differently
+            except Exception as error:  # a revision may lack anything, or do it differently
                 answer = {"lacks": f"{type(error).__name__}: {' '.join(str(error).split())}"}
         else:
             answer = timed(ready[command["time"]].do, command["repeat"])

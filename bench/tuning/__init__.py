@@ -1,1 +1,1 @@
-"""Search noise factors on training runs, and look once at what was held out."""
+"""Search noise factors on training runs, and check the best once on held-out runs."""

@@ -19,7 +19,7 @@ from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
 from ..results.paired import FEWEST_SEEDS, TAKE, bootstrap_interval
 
-DUE: dict[str, float] = (
+EXPECTED: dict[str, float] = (
     dict.fromkeys(INNOVATIONS, 1.0)
     | {f"nees_{block}": 3.0 for block in ("position", "attitude", "velocity")}
     | {"nees_biases": 6.0, "nees_all": 15.0}
@@ -71,15 +71,15 @@ class Objective:
     @property
     def is_distance(self) -> bool:
         """Whether the loss is a distance from the expected value, 0 at best."""
-        return self.score in DUE
+        return self.score in EXPECTED
 
     def lacking(self, row: Mapping[str, Any]) -> str | None:
-        """Return why a row has not the score; None where it has."""
+        """Return why a row lacks the score; None if it has it."""
         name = row["log"] if row["seed"] is None else f"{row['log']}/{row['seed']}"
         if row["status"] != "done":
             return f"{name}: {row['status']}: {row['cause']}"
         if row["output"] != self.output or row.get(self.score) is None:
-            return f"{name}: no {self.score} of what is said {self.output}"
+            return f"{name}: no {self.score} of the {self.output} output"
         return None
 
     def marks(self, rows: Sequence[Mapping[str, Any]]) -> Marks:
@@ -98,9 +98,9 @@ class Objective:
         return TAKE[OVER_SEEDS[self.score]](values, weights, axis)
 
     def loss(self, values: Array, weights: Array, axis: int = -1) -> Array:
-        """Return what is to become smaller."""
+        """Return the loss of a score."""
         score = self.taken(values, weights, axis)
-        return np.abs(np.log(score / DUE[self.score])) if self.is_distance else score
+        return np.abs(np.log(score / EXPECTED[self.score])) if self.is_distance else score
 
     def interval(self, marks: Marks) -> tuple[float, float] | None:
         """Return the 95 % bootstrap interval over runs of the score; None where they are too few."""
@@ -110,7 +110,7 @@ class Objective:
         return bootstrap_interval((v, n, v), lambda v, n, _, axis=-1: self.taken(v, n, axis), "BCa", 0, **BOOTSTRAP)
 
     def gain(self, tuned: Marks, sheet: Marks) -> tuple[float, tuple[float, float] | None]:
-        """Return by how much the tuned are better, and the 95 % bootstrap interval of that, a run's two together.
+        """Return the gain of the tuned over the data sheet, and its 95 % bootstrap interval, paired by run.
 
         The gain is the loss of the data sheet less that of the tuned, or the logarithm of their ratio where the loss is
         no distance: 0.1 is a tenth less either way.

@@ -20,12 +20,12 @@ from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..errors import ExperimentError
 from ..output.tables import terminal
 from ..results.paired import FEWEST_SEEDS
-from .objective import DUE, Marks
+from .objective import EXPECTED, Marks
 from .search import Search, Trial, best_of
 from .tuning import Tuning
 
 NEAR = 0.01
-"""A trial is near the best where its loss is within 1 % of the best's (of a distance: within 0.01)."""
+"""A trial is near the best where its loss is within 1 % of the best's (within 0.01 if it is a distance)."""
 
 FLAT = 3.0
 """A dial hardly matters where trials near the best span more than this factor of it."""
@@ -42,10 +42,10 @@ class Outcome:
 
     Attributes:
         trials: every one.
-        sheet, best: the first, with the data sheet's noise, and that of the smallest loss.
-        train: their scores on what trained; None where the data sheet's runs did not come to their end.
-        held_out: their scores on what was held out, of the runs that both ended; None where there are none.
-        lost: why runs on what was held out have no score.
+        sheet, best: the first trial, with the data sheet's noise, and the one with the smallest loss.
+        train: their scores on training runs; None if the data sheet's runs did not finish.
+        held_out: their scores on the held-out runs that both finished; None if there are none.
+        lost: why held-out runs have no score.
     """
 
     tuning: Tuning
@@ -58,7 +58,7 @@ class Outcome:
 
     @property
     def warnings(self) -> list[str]:
-        """What speaks against the best, in sentences: above all that its gain is not borne out by what was held out."""
+        """Warnings about the best trial, above all that its gain is not confirmed on held-out runs."""
         found = list(self.lost)
         low, high = self.tuning.low, self.tuning.high
         for dial, factor in self.best.factors.items():
@@ -67,19 +67,19 @@ class Outcome:
         if self.best.number == 0 or self.sheet.loss is None or self.best.loss is None:
             return found
         if self.held_out is None:
-            return [*found, "nothing held out has been scored: the gain on training is not borne out by anything"]
+            return [*found, "no held-out run has a score: the gain on training is not confirmed"]
         trained = self.tuning.objective.gain_of(self.best.loss, self.sheet.loss)
         gained, interval = self.tuning.objective.gain(*reversed(self.held_out))
         low, high = interval or (gained, math.inf if gained >= trained / 2 else gained)  # too few for one
         if low <= 0:
             found.append(
-                f"the gain on training ({self.words(trained)}) is not borne out by what was held out "
+                f"the gain on training ({self.words(trained)}) is not confirmed on held-out runs "
                 f"({self.words(gained, interval)}): keep the data sheet, or train on more logs"
             )
         elif high < trained:
             found.append(
-                f"training and held-out part: a gain of {self.words(trained)} on training, of "
-                f"{self.words(gained, interval)} on what was held out: expect no more than the latter"
+                f"training and held-out runs differ: a gain of {self.words(trained)} on training, of "
+                f"{self.words(gained, interval)} on held-out runs: expect no more than the latter"
             )
         return found
 
@@ -103,10 +103,10 @@ class Outcome:
         return yaml.safe_dump([entry], default_flow_style=None, sort_keys=False, width=110)
 
     def words(self, gain: float, interval: tuple[float, float] | None = None) -> str:
-        """Return a gain as people read it."""
+        """Return a gain as text."""
         if self.tuning.objective.is_distance:
             bounds = "" if interval is None else f" [{interval[0]:.3g}, {interval[1]:.3g}]"
-            return f"{gain:.3g}{bounds} nearer in logarithm"
+            return f"{gain:.3g}{bounds} closer in logarithm"
         bounds = "" if interval is None else f" [{_percent(interval[0])}, {_percent(interval[1])}]"
         return f"{_percent(gain)}{bounds} %"
 
@@ -116,7 +116,7 @@ def _percent(gain: float) -> str:
 
 
 def run_with_bar(search: Search, trials: int, jobs: int = 0) -> None:
-    """Run the search, then the data sheet and the best on what was held out; a bar tells how far it is."""
+    """Run the search, then the data sheet and the best on held-out runs, with a progress bar."""
     columns = (TextColumn("{task.fields[what]}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
                TextColumn("{task.description}", markup=False))  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
@@ -132,15 +132,15 @@ def run_with_bar(search: Search, trials: int, jobs: int = 0) -> None:
 
 
 def judge(search: Search) -> Outcome:
-    """Score the data sheet and the best on what trained and, as far as they were run on it, on what was held out.
+    """Score the data sheet and the best on training runs and, as far as they exist, on held-out runs.
 
     Raises:
-        ExperimentError: no trial came to its end.
+        ExperimentError: no trial finished.
     """
     tuning, trials = search.tuning, search.trials()
     objective, sheet, best = tuning.objective, trials[0], best_of(trials)
     if best is None:
-        raise ExperimentError(f"{tuning.estimator.label}: no trial came to its end; {sheet.cause}")
+        raise ExperimentError(f"{tuning.estimator.label}: no trial finished; {sheet.cause}")
     lost, pairs = [], []
     for run in tuning.split.held_out:
         rows = [row for trial in (sheet, best) for row in search.rows(trial.number, [run])]
@@ -176,7 +176,7 @@ def write_outcome(outcome: Outcome) -> list[Path]:
 
 
 def draw_search(outcome: Outcome) -> Figure:
-    """Draw each trial's loss on training against each factor: the data sheet, the best, and what is near the best."""
+    """Draw each trial's training loss against each factor; mark the data sheet, the best, and trials near the best."""
     tuning, columns = outcome.tuning, min(3, len(outcome.tuning.dials))
     lines = -(-len(tuning.dials) // columns)
     figure, panels = empty_figure(lines, columns, WIDTH_IN, 0.9 + 2.0 * lines, share_x=False)
@@ -196,7 +196,7 @@ def draw_search(outcome: Outcome) -> Figure:
         axes.set_xlabel(f"factor on the sigma of {dial}")
     for axes in panels[::columns]:
         axes.set_ylabel(
-            f"|ln {tuning.objective.score} / due|" if tuning.objective.is_distance else tuning.objective.score
+            f"|ln {tuning.objective.score} / expected|" if tuning.objective.is_distance else tuning.objective.score
         )
     for axes in panels[len(tuning.dials) :]:
         axes.set_visible(False)
@@ -207,13 +207,13 @@ def draw_search(outcome: Outcome) -> Figure:
         handle("trial", "o", PALETTE[0], True),
         handle("data sheet", "s", "black", True),
         handle("best; shaded: trials within 1 % of it", "*", PALETTE[1], True),
-    ] + ([handle("did not come to its end", "x", PALETTE[6], True)] if bad else [])
+    ] + ([handle("did not finish", "x", PALETTE[6], True)] if bad else [])
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
 
 
 def print_outcome(outcome: Outcome, console: Console | None = None) -> None:
-    """Print the scores, the factors with how sharp each is, what speaks against them, and the YAML to paste."""
+    """Print the scores, the factors with their sharpness, the warnings, and the YAML to paste."""
     console = console or terminal.console()
     tuning = outcome.tuning
     runs = (len(tuning.split.train), len(outcome.held_out[0].values) if outcome.held_out else 0)
@@ -235,7 +235,7 @@ def print_outcome(outcome: Outcome, console: Console | None = None) -> None:
         factors.add_row(dial, f"{outcome.best.factors[dial]:.3g}", f"{low:.3g} to {high:.3g}", says)
     console.print(factors)
     if outcome.best.number == 0:
-        console.print("nothing was better than the data sheet")
+        console.print("no trial was better than the data sheet")
     for warning in outcome.warnings:
         console.print(f"warning: {warning}", style="red", highlight=False, markup=False, soft_wrap=True)
     console.print(outcome.spec(), highlight=False, markup=False, soft_wrap=True)
@@ -254,10 +254,10 @@ def _few(outcome: Outcome) -> bool:
 
 
 def _caption(outcome: Outcome) -> str:
-    due = DUE.get(outcome.tuning.objective.score)
-    says = "" if due is None else f"{due:.3g} when honest; "
+    expected = EXPECTED.get(outcome.tuning.objective.score)
+    says = "" if expected is None else f"{expected:.3g} if consistent; "
     few = "too few held-out runs for an interval" if _few(outcome) else "intervals: 95 %, over runs"
     if outcome.held_out is None or outcome.best.number == 0 or outcome.best.loss is None:
         return f"{says}{few}"
     gained, interval = outcome.tuning.objective.gain(*reversed(outcome.held_out))
-    return f"{says}{few}; gain on what was held out: {outcome.words(gained, interval)}"
+    return f"{says}{few}; gain on held-out runs: {outcome.words(gained, interval)}"

@@ -69,11 +69,11 @@ class Search:
 
     @property
     def notes(self) -> list[str]:
-        """What the user should know before the search begins, in sentences."""
+        """Notes for the user before the search begins."""
         split = self.tuning.split
         found = [f"training on {in_words(split.train)}; held out: {in_words(split.held_out)}"]
         if split.aside:
-            found.append(f"taking no part: {', '.join(split.aside)}")
+            found.append(f"not used: {', '.join(split.aside)}")
         if self.resumed:
             found.append(f"{self.resumed} trials were done already")
         elif self.others:
@@ -81,10 +81,10 @@ class Search:
         return found
 
     def run(self, trials: int = 60, jobs: int = 0) -> Iterator[Progress]:
-        """Run what is missing of this many trials on the training runs; tell after each run how far it is.
+        """Run the missing runs of this many trials on training logs; yield the progress after each run.
 
         Raises:
-            ExperimentError: the data sheet's runs have no such score; no trial of the first batch came to its end.
+            ExperimentError: the data sheet's runs lack the score; no trial of the first batch finished.
         """
         yield self._progress(trials)
         while waiting := self._ask(trials):
@@ -94,7 +94,7 @@ class Search:
             self._tell()
 
     def run_held_out(self, trials: Sequence[Trial], jobs: int = 0) -> Iterator[None]:
-        """Run these trials on what was held out; yields after each run."""
+        """Run these trials on held-out logs; yield after each run."""
         yield from self._runs({trial.number: trial.factors for trial in trials}, self.tuning.split.held_out, jobs)
 
     def trials(self) -> list[Trial]:
@@ -102,7 +102,7 @@ class Search:
         return [self._known[number] for number in sorted(self._known)]
 
     def rows(self, number: int, runs: Sequence[Run]) -> list[Row]:
-        """Return one row per run that has ended: of the objective's output, where there is such."""
+        """Return one row per run that has ended: of the objective's output, if it exists."""
         found = [self._rows.get(self._key(number, run), []) for run in runs]
         output = self.tuning.objective.output
         return [next((row for row in rows if row["output"] == output), rows[0]) for rows in found if rows]
@@ -122,7 +122,7 @@ class Search:
         last = max(asked - 1, 0) // BATCH * BATCH
         if not self._waiting:
             end = (asked // BATCH + 1) * BATCH
-        else:  # a batch that was stopped while it was asked for is asked for to its end
+        else:  # complete a batch that was interrupted while it was chosen
             end = last + BATCH if all(number in self._waiting for number in range(last, asked)) else asked
         factor = FloatDistribution(self.tuning.low, self.tuning.high, log=True)
         space: dict[str, Any] = dict.fromkeys(self.tuning.dials, factor)
@@ -139,7 +139,7 @@ class Search:
         return dict(self._waiting)
 
     def _runs(self, trials: Mapping[int, dict[str, float]], runs: Sequence[Run], jobs: int) -> Iterator[None]:
-        """Run what is missing of these trials, log by log, and store each run as it ends."""
+        """Run the missing runs of these trials, log by log, and store each run as it ends."""
         tasks = [
             self.tuning.task(number, factors, run, self._study.study_name)
             for run in runs
@@ -168,7 +168,7 @@ class Search:
                 self._study.tell(number, trial.loss)
         known = self.trials()
         if known and not self._waiting and all(trial.loss is None for trial in known):
-            raise ExperimentError(f"{self.tuning.estimator.label}: no trial came to its end; {known[0].cause}")
+            raise ExperimentError(f"{self.tuning.estimator.label}: no trial finished; {known[0].cause}")
 
     def _judged(self, number: int, factors: dict[str, float]) -> Trial:
         objective, rows = self.tuning.objective, self.rows(number, self.tuning.split.train)
@@ -201,7 +201,7 @@ def searching(tuning: Tuning) -> Iterator[Search]:
     """Open the study and the store of a search, alone; make them where there are none.
 
     Raises:
-        ExperimentError: optuna is missing; the files cannot be written, or are not such; another search is at it.
+        ExperimentError: optuna is missing; the files cannot be written, or are no such files; another search uses them.
     """
     try:
         import optuna
@@ -213,7 +213,7 @@ def searching(tuning: Tuning) -> Iterator[Search]:
         tuning.folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ExperimentError(f"{tuning.folder}: cannot be made ({error.strerror}); give another --out") from None
-    optuna.logging.set_verbosity(optuna.logging.ERROR)  # what there is to say we say ourselves
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # its messages are replaced by ours
     with sole_writer(tuning.folder), Store(tuning.folder / "runs.sqlite") as store:
         try:
             storage = optuna.storages.RDBStorage(f"sqlite:///{path}")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from ...datasets.described.opening import catalog_names
 from ..errors import ExperimentError
-from ..experiment.plan import Experiment, Run, Sides
+from ..experiment.plan import Experiment, Run, SplitPatterns
 
 NAME_THEM = 'name them: `tune: {train: [...], held_out: [...]}`, or --train and --held-out, by log or by "log/seed"'
 
@@ -23,29 +23,29 @@ class Split(NamedTuple):
 
 
 def unit(run: Run) -> str:
-    """Return what a run's log and seed are called: "lawnmower/3", or "dive_7" of a recorded log."""
+    """Return the name of a run's log and seed: "lawnmower/3", or "dive_7" of a recorded log."""
     return run.log.name if run.seed is None else f"{run.log.name}/{run.seed}"
 
 
 def in_words(runs: Sequence[Run]) -> str:
-    """Return what the logs of these runs are called, each once, with its seeds."""
+    """Return the names of the logs of these runs, each once, with its seeds."""
     seeds: dict[str, list[str]] = {}
     for run in runs:
         seeds.setdefault(run.log.name, []).extend([] if run.seed is None else [str(run.seed)])
     return "; ".join(f"{name}, seeds {', '.join(of)}" if of else name for name, of in seeds.items())
 
 
-def divide(experiment: Experiment, label: str, sides: Sides) -> Split:
-    """Divide the runs of the estimator of this label; see `Sides`.
+def divide(experiment: Experiment, label: str, patterns: SplitPatterns) -> Split:
+    """Divide the runs of the estimator of this label; see `SplitPatterns`.
 
     Raises:
-        ExperimentError: one side is empty; a log (or, of simulated logs, a seed) is on both; a pattern matches nothing.
+        ExperimentError: one part is empty; a log (or a seed of simulated logs) is in both; a pattern matches nothing.
     """
     runs = [run for run in experiment.runs() if run.estimator.label == label]
-    if sides.train or sides.held_out:
-        train, held_out = _named(runs, sides.train, "train"), _named(runs, sides.held_out, "held out")
-        train = train if sides.train else [run for run in runs if run not in held_out]
-        held_out = held_out if sides.held_out else [run for run in runs if run not in train]
+    if patterns.train or patterns.held_out:
+        train, held_out = _named(runs, patterns.train, "train"), _named(runs, patterns.held_out, "held out")
+        train = train if patterns.train else [run for run in runs if run not in held_out]
+        held_out = held_out if patterns.held_out else [run for run in runs if run not in train]
     else:
         half = (len(experiment.seeds) + 1) // 2
         train = [run for run in runs if run.seed in experiment.seeds[:half]]
@@ -70,18 +70,18 @@ def _matches(run: Run, pattern: str) -> bool:
 
 
 def _refuse_both(train: Sequence[Run], held_out: Sequence[Run]) -> None:
-    """Refuse a recording, or a seed, that is on both sides: the search would see what is held out."""
+    """Refuse a recording, or a seed, that is on both patterns: the search would see what is held out."""
     for ours in train:
         for theirs in held_out:
             if _source(ours) == _source(theirs):
                 what = "the same recording" if ours.seed is None else "the same random numbers"
                 raise ExperimentError(
-                    f"{unit(ours)} trains and {unit(theirs)} is held out: {what}; what is held out must be new"
+                    f"{unit(ours)} trains and {unit(theirs)} is held out: {what}; held-out data must be new"
                 )
 
 
 def _source(run: Run) -> object:
-    """Return what no two sides may share: a recording, by its place or its name in the catalog; or a seed."""
+    """Return what the two parts must not share: a recording, by path or catalog name; or a seed."""
     if run.seed is not None:
         return run.seed
     path = Path(run.log.log or "")

@@ -16,7 +16,7 @@ from ...datasets.errors import nearest
 from ...datasets.log import Log
 from ..errors import ExperimentError
 from ..execution.task import Task
-from ..experiment.plan import EstimatorSpec, Experiment, Run, Sides
+from ..experiment.plan import EstimatorSpec, Experiment, Run, SplitPatterns
 from ..metrics.scoring import can_judge
 from ..results.identity import content_sha256
 from .objective import Objective
@@ -27,14 +27,14 @@ IMU = ("accel", "gyro")
 
 @dataclass(frozen=True)
 class Tuning:
-    """What is searched: an estimator's factors on its sigmas, each from low to high, on the runs that train.
+    """A search: factors on an estimator's sigmas, each from low to high, on training runs.
 
     Attributes:
         experiment: how runs are scored, and their limits.
-        estimator: its options, `inflate` among them, are kept where no dial changes them.
-        split: what trains, and what is held out.
+        estimator: its options, `inflate` among them, are kept unless a factor changes them.
+        split: training runs and held-out runs.
         dials: sensors, "accel" and "gyro".
-        objective: what is to become smaller.
+        objective: the loss.
         low, high: the factors' range.
         seed: of the search.
         readings: hash of each recorded log that trains, by its name.
@@ -56,7 +56,7 @@ class Tuning:
 
     @property
     def identity(self) -> str:
-        """Hash of all that decides the losses and the sequence of trials."""
+        """Hash of everything that losses and the sequence of trials depend on."""
         sheet = [self.task(0, {}, run).identity for run in self.split.train]
         decides = [sheet, self.dials, self.objective.score, self.objective.output, self.low, self.high, self.seed]
         return sha256(json.dumps(decides).encode()).hexdigest()[:12]
@@ -77,7 +77,7 @@ class Tuning:
 def prepare(
     experiment: Experiment,
     estimator: str | None = None,
-    sides: Sides = Sides(),  # noqa: B008
+    patterns: SplitPatterns = SplitPatterns(),  # noqa: B008
     sensors: Sequence[str] = (),
     objective: Objective = Objective("ate_rmse_m"),  # noqa: B008
     span: tuple[float, float] = (0.1, 10.0),
@@ -86,11 +86,11 @@ def prepare(
     data: Path | None = None,
     repair: bool = False,
 ) -> Tuning:
-    """Check a search before it begins. Of the recorded logs only those that train are opened.
+    """Check a search before it begins. Of the recorded logs only those for training are opened.
 
     Args:
         estimator: its label; may be left out where there is only one that can be tuned.
-        sides: where neither is said, the experiment's `tune`.
+        patterns: if empty, the experiment's `tune`.
         sensors: whose factors are searched; all that the estimator uses and the training logs have, when left out.
 
     Raises:
@@ -99,7 +99,7 @@ def prepare(
     if not 0 < span[0] < 1 < span[1]:
         raise ExperimentError(f"the range of factors must hold 1 inside, found {span[0]:g} to {span[1]:g}")
     spec = _chosen(experiment, estimator)
-    split = divide(experiment, spec.label, sides if sides.train or sides.held_out else experiment.tune)
+    split = divide(experiment, spec.label, patterns if patterns.train or patterns.held_out else experiment.tune)
     for run in split.held_out:
         _is_there(run, data)
     readings, aboard = {}, set(IMU)

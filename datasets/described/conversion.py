@@ -600,7 +600,7 @@ def _on_the_globe(rows: _Rows, part: Any) -> tuple[Array, Array, Array | None]:
 
 
 def _offset(rows: _Rows, part: Any) -> Array | None:
-    """Return (n, 3) m, the local offset from the global position; None if there is none."""
+    """Return (n, 3) m, the local offset from the global position; None without one."""
     return None if part.geodetic is None or part.position is None else _enu(rows.si(part.position), part.frame)
 
 

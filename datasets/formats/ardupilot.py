@@ -240,12 +240,12 @@ class _Scan:
 
     def notes(self) -> tuple[str, ...]:
         """Return what was skipped, one sentence each."""
-        told = [
+        notes = [
             (self._gaps, f"ardupilot: {self._gaps} stretches, {self._skipped} bytes, of no whole message skipped"),
             (self._unsound, f"ardupilot: {self._unsound} FMT messages that contradict themselves skipped"),
             (self._cut_off is not None, f"ardupilot: the file ends inside a message{self._cut_off}"),
         ]
-        return tuple(note for count, note in told if count)
+        return tuple(note for count, note in notes if count)
 
     def _define(self, number: int, layout: Layout) -> None:
         if number != FMT:

@@ -103,8 +103,8 @@ def mcap_messages(
     if damaged:
         found.notes.append(f"{path.name}: {damaged} damaged chunks or records skipped")
     if not reading.whole:
-        told = "; ".join(["", *found.notes])
-        raise DatasetError(f"{path}: contains no whole message{told}")
+        notes = "; ".join(["", *found.notes])
+        raise DatasetError(f"{path}: contains no whole message{notes}")
 
 
 class _Reading:

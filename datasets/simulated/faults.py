@@ -1,4 +1,4 @@
-"""Faults of simulated sensors, of which no estimator is told.
+"""Faults of simulated sensors, unknown to estimators.
 
 Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig. They keep
 their size when a scenario scales its noise.

@@ -15,7 +15,7 @@ TOLD = {
 """Settings of sensors that neither the rig nor the readings show."""
 
 
-def told(scenario: Scenario) -> list[str]:
+def scenario_notes(scenario: Scenario) -> list[str]:
     """Return sentences on the world, and on each sensor's settings, delays and faults, where there are any."""
     return [*_world(scenario), *_biases(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
 

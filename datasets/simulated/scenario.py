@@ -189,7 +189,7 @@ class Scenario:
 
     @cached_property
     def rig(self) -> Rig:
-        """What the estimators are told of the vehicle."""
+        """The rig that estimators get."""
         aboard = {sensor: getattr(self, sensor) for sensor in ("depth", "gps", "heading")}
         return Rig(
             imu_noise=self.imu.figures,

@@ -11,7 +11,7 @@ from ..state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Belie
 from ..trajectory import Trajectory
 from .imu import sample_imu, simulate_biases
 from .missions import fly
-from .notes import told
+from .notes import scenario_notes
 from .random_streams import random_stream
 from .readings import read, ticks
 from .scenario import Scenario
@@ -26,7 +26,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         path: what the mission "recorded" follows, in place of the scenario's file.
 
     Raises:
-        DatasetError: the seed is negative, or the path is none that a vehicle can follow.
+        DatasetError: the seed is negative, or no vehicle can follow the path.
     """
     if seed < 0:
         raise DatasetError(f"simulate: seed must not be negative, found {seed}")
@@ -52,7 +52,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
             f"Simulated: {scenario.mission}, {scenario.duration_s:g} s, {grade} IMU at {scenario.imu.rate_hz:g} Hz, "
             f"seed {seed}, noise scaled by {scenario.noise_scale:g}; {earth}.",
             *motion.notes,
-            *told(scenario),
+            *scenario_notes(scenario),
         ),
         origin=None if scenario.latitude_deg is None else (scenario.latitude_deg, 0.0),
     )

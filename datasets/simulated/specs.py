@@ -45,7 +45,7 @@ MISSIONS = {
 
 
 RECORDED = "recorded"
-"""The mission whose path is a trajectory of somebody's."""
+"""The mission that follows a given trajectory."""
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -159,7 +159,7 @@ class GpsSpec:
 
 @dataclass(frozen=True, config=STRICT)
 class HeadingSpec:
-    """Magnetic heading, 1–2° after calibration. No estimator is told of its bias, nor of soft iron.
+    """Magnetic heading, 1–2° after calibration. Its bias and soft iron are unknown to estimators.
 
     Soft iron adds soft_iron_deg · sin 2(ψ − soft_iron_axis_deg): the quadrantal deviation of a compass.
     """

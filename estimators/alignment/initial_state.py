@@ -1,18 +1,18 @@
-"""The state at the end of a log's first seconds, by least squares over all that was heard in them.
+"""The state at the end of a log's first seconds, by least squares over all readings in them.
 
-Unknown, at the end E of the window: the velocity u of the IMU and what gravity is, γ, both in B; the biases b_a and
-b_g; the yaw; the position of B; and, where no DVL tells u, the velocity of B in W. The level is the direction of −γ.
+Unknown, at the end E of the window: the velocity u of the IMU and gravity γ, both in B; the biases b_a and
+b_g; the yaw; the position of B; and, where no DVL measures u, the velocity of B in W. The level is the direction of −γ.
 With Φ, R_EB and u(t) of `window`, the rows are
 
     DVL at t            R_EB(t)ᵀ u(t) − ω × p_BI_B                          v_WB_B
-    the vehicle         its velocity in B at the start of the window is that at its end
+    constant velocity   the velocity in B at the start of the window equals that at its end
     at rest             u(t) at both ends is zero, and the mean of the gyro is b_g
     heading sensor      yaw and the azimuth of R_EB R_BH e_x by the level   ψ
     GPS at t            p + R_WB (D(t) + R_EB(t) p_BG_B)                    p_WG_W
     depth               p · e_z and the lever arm                           z
 
-with D(t) where B was, by gyro and DVL. So the errors of all parts go together as they must: of the biases with the
-tilt that they cause, of the yaw with the velocity and the position that it turns.
+with D(t) the position of B relative to the end, by gyro and DVL. So the errors of all parts are correlated as they
+should be: biases with the tilt that they cause, yaw with the velocity and the position that it rotates.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from .rest import REST_M_S, mean_velocity
 from .window import Window, skew
 
 MOTION_M_S2 = 0.1
-"""Sigma of the vehicle's own mean acceleration in B over the window: where no sensor sees it, the level mistakes it
-for tilt."""
+"""Sigma of the vehicle's own mean acceleration in B over the window: where no sensor measures it, it appears
+as tilt."""
 HEADING_FLOOR_RAD = np.radians(1.0)
-"""No heading sensor is believed beyond this: its errors do not average out over a window."""
+"""Least sigma of a heading by sensor: its errors do not average out over a window."""
 UNKNOWN_HEADING_RAD = np.pi / np.sqrt(3)
 """Standard deviation of a heading that is equally likely in every direction."""
 SLIP_RAD = 0.05
-"""A vehicle whose sideways velocity is not measured goes this far off its nose."""
+"""Sigma of the drift angle of a vehicle whose sideways velocity is not measured."""
 UNKNOWN_SPEED_M_S, FASTEST_M_S = 1.5, 30.0
-"""Sigma of a velocity of which nothing is known; and of one that the fixes tell, of a ship or a car as well."""
+"""Sigma of an unknown velocity; and of one from fixes, of a ship or a car as well."""
 ORIGIN_SIGMA_M = 0.5
-"""How well the vehicle's place at the start of the log is W's origin."""
+"""Sigma of the vehicle's position at the start of the log relative to W's origin."""
 UNKNOWN_DEPTH_M = 5.0
 """Sigma of the depth at the start without a depth sensor: a log begins near the surface."""
 NEWEST = 3
-"""So many readings are waited for; depth's errors stay for longer, and the median of so many counts as one."""
+"""Number of readings to wait for; errors of depth are correlated for longer, so the median of so many counts as one."""
 OUTLIER_SIGMAS, OUTLIER_M_S = 6.0, 0.3
 """A DVL reading further than both from the median of the five about it is left out."""
 LEAST_ACCEL_BIAS, LEAST_GYRO_BIAS = 1e-6, 1e-9
@@ -57,7 +57,7 @@ SPEED, GRAVITY, ACCEL, GYRO = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12
 YAW, PLACE, WAY = 12, slice(13, 16), slice(16, 19)
 UNKNOWNS = 19
 ITERATIONS = 4
-"""Times that the rows of heading, position and height are linearised anew."""
+"""How often the rows of heading, position and height are relinearised."""
 EACH = np.eye(UNKNOWNS)
 LEVI_CIVITA = skew(np.eye(3)).transpose(1, 0, 2) * -1.0
 """ε_ijk, (3, 3, 3)."""
@@ -65,7 +65,7 @@ LEVI_CIVITA = skew(np.eye(3)).transpose(1, 0, 2) * -1.0
 
 @dataclass
 class Rows:
-    """Linear equations H x = z ± sigma about the unknowns; what has no finite sigma is left out."""
+    """Linear equations H x = z ± sigma of the unknowns; rows without a finite sigma are left out."""
 
     H: list[Array] = field(default_factory=list)
     z: list[Array] = field(default_factory=list)
@@ -97,21 +97,21 @@ class Rows:
 
 
 class InitialState:
-    """The belief at the end of a window, and how it was got.
+    """The belief at the end of a window, and how it was found.
 
     Args:
-        log: its truth and its prior are not looked at.
-        start_ns, end_ns: so much of the log is used; both are times of IMU samples.
-        level_s: so much of its end tells level and velocity, and at least what holds three readings of the DVL; over
-            longer the gyro's noise would tilt them.
+        log: its truth and its prior are not used.
+        start_ns, end_ns: the part of the log that is used; both are times of IMU samples.
+        level_s: length of its last part, from which level and velocity are estimated; extended to hold three readings
+            of the DVL. Over a longer part the gyro's noise would tilt them.
         at_rest: the vehicle does not move in it.
-        heading_by_gps: the yaw is that which lays the track onto the fixes.
+        heading_by_gps: the yaw is found by fitting the track to the fixes.
 
     Attributes:
         belief: at end_ns.
-        heading: by what: "sensor", "by GPS", "unknown".
+        heading: its source: "sensor", "by GPS", "unknown".
         yaw_sigma: rad.
-        notes: in sentences.
+        notes: sentences on how each part was found.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class InitialState:
         self._levelled_by = 0  # readings of the DVL
         self._stretch = 1.0  # of the sigma of GPS
         self.belief, cov = self._solve()
-        self.yaw_sigma, self.notes = float(np.sqrt(cov[YAW, YAW])), self._told(cov)
+        self.yaw_sigma, self.notes = float(np.sqrt(cov[YAW, YAW])), self._notes(cov)
 
     def _solve(self) -> tuple[Belief, Array]:
         linear = Rows()
@@ -162,14 +162,14 @@ class InitialState:
         return self._as_belief(x, cov), cov
 
     def _iterated(self, linear: Rows, x: Array) -> tuple[Array, Array]:
-        """Return the unknowns and their covariance; only rotations are not linear, and only the yaw is turned far."""
+        """Return the unknowns and their covariance; only rotations are not linear, and only the yaw may be far off."""
         cov = np.eye(UNKNOWNS)
         for _ in range(ITERATIONS):
             x, cov = self._solved(linear, x)
         return x, cov
 
     def _solved(self, linear: Rows, x: Array | None) -> tuple[Array, Array]:
-        """Solve the linear rows, and those of heading and place as they are about x; without x, nothing of these."""
+        """Solve the linear rows and, if x is given, those of heading and position linearised at x."""
         rows = Rows([*linear.H], [*linear.z], [*linear.sigma])
         if x is None:
             rows.add(EACH[YAW:], np.zeros(UNKNOWNS - YAW), 1.0)
@@ -188,7 +188,7 @@ class InitialState:
         rows.add(EACH[GYRO], np.zeros(3), max(self._noise.gyro_bias_sigma, LEAST_GYRO_BIAS))
 
     def _velocity_at(self, k: int, nominal_B: Array) -> tuple[Array, Array]:
-        """Return H (3, 19) and constant (3,) of the velocity of the IMU at a moment of the window, in B there."""
+        """Return H (3, 19) and constant (3,) of the velocity of the IMU at time k of the window, in B at that time."""
         w, R, left_s = self._window, self._window.R_EB[k].T, self._window.left_s[k]
         u_E = w.R_EB[k] @ nominal_B
         H = np.zeros((3, UNKNOWNS))
@@ -197,7 +197,7 @@ class InitialState:
         return H, -R @ w.push[k]
 
     def _know_motion(self, rows: Rows) -> None:
-        """Add the DVL's readings, and that the vehicle goes on as it did."""
+        """Add the readings of the DVL, and that the velocity in B stays constant."""
         w, lever_B, log = self._window, self._rig.imu.p_BS_B, self._log
         nominal, since = np.zeros(3), []
         if log.dvl is not None:
@@ -218,7 +218,7 @@ class InitialState:
         rows.add(H, of_lever - constant, np.hypot(MOTION_M_S2 * w.length_s, drift))
 
     def _know_rest(self, rows: Rows) -> None:
-        """Add that the velocity is zero at both ends of the window, and that the gyro shows nothing but its bias."""
+        """Add that the velocity is zero at both ends of the window, and that the mean of the gyro is its bias."""
         w, velocity = self._window, mean_velocity(self._log, int(self._window.t_ns[0]), int(self._window.t_ns[-1]))
         assert velocity is not None
         still = np.hypot(REST_M_S, velocity[1].max())
@@ -232,12 +232,12 @@ class InitialState:
 
     @property
     def _measured(self) -> list[bool]:
-        """Which of the three axes of the velocity in B any reading measures."""
+        """Return which of the three axes of the velocity in B are measured by any reading."""
         dvl = self._log.dvl
         return [dvl is not None and bool(np.isfinite(dvl.sigma[self._dvl, axis]).any()) for axis in range(3)]
 
     def _likely_dvl(self) -> TimeArray:
-        """Return the rows of the DVL that do not lie far out."""
+        """Return the rows of the DVL that are not outliers."""
         rows = self._whole.heard(self._log.dvl)
         if self._log.dvl is None or len(rows) < 3:
             return rows
@@ -272,12 +272,12 @@ class InitialState:
         mean = np.arctan2(np.sin(left).mean(), np.cos(left).mean())
         rows.add(H, np.array([mean]), total, x)
 
-    # --- place and way -----------------------------------------------------------------------------------------------
+    # --- position and path --------------------------------------------------------------------------------------------
 
     def _ways(self) -> tuple[Array, Array]:
-        """Return where B was at all moments, from where it ends, in E axes (n, 3), and its derivative by the gyro bias.
+        """Return the position of B relative to its last one, in E axes (n, 3), and its derivative by the gyro bias.
 
-        Where no velocity is known, (n, 3, 3): by the velocity in B, held to be the same all the way.
+        Where no velocity is known, (n, 3, 3): by the velocity in B, taken as constant.
         """
         w, dvl = self._whole, self._log.dvl
         if not self._knows_speed:
@@ -292,7 +292,7 @@ class InitialState:
         return w.way(v_B)
 
     def _point(self, x: Array, k: int, lever_B: Array) -> tuple[Array, Array]:
-        """Return H (3, 19) and position (3,) in W of a point of the body at moment k."""
+        """Return H (3, 19) and position (3,) in W of a point of the body at time k."""
         R_WE, lever_E = attitude(x), self._whole.R_EB[k] @ lever_B
         H = np.zeros((3, UNKNOWNS))
         by_gyro = -skew(lever_E) @ self._whole.turn[k]
@@ -300,7 +300,7 @@ class InitialState:
             turned_E = q = self._way[k] + lever_E
             by_gyro = by_gyro + self._way_by_gyro[k]
         else:
-            turned_E, q = lever_E, self._way[k] @ R_WE.T @ x[WAY] + lever_E  # the way is one in W
+            turned_E, q = lever_E, self._way[k] @ R_WE.T @ x[WAY] + lever_E  # the path is in W
             H[:, WAY] = R_WE @ self._way[k] @ R_WE.T
         H[:, PLACE], H[:, GYRO] = np.eye(3), R_WE @ by_gyro
         by_turn = -R_WE @ skew(turned_E)
@@ -308,7 +308,7 @@ class InitialState:
         return H, x[PLACE] + R_WE @ q
 
     def _drift_m(self, k: int) -> float:
-        """Return how far off the way is from moment k to the end."""
+        """Return the sigma, m, of the path from time k to the end."""
         left_s, dvl = float(self._whole.left_s[k]), self._log.dvl
         if self.at_rest:
             return REST_M_S * left_s
@@ -319,7 +319,7 @@ class InitialState:
         return float(np.median(sigma[np.isfinite(sigma)])) * np.sqrt(left_s * max(between_s, min(left_s, 1.0)))
 
     def _know_place(self, rows: Rows, x: Array) -> None:
-        """Add the fixes: the last one where the velocity and the heading are known, else all; or W's origin."""
+        """Add the fixes: the last one if velocity and heading are known, else all; without fixes, W's origin."""
         gps = self._log.gps
         if gps is not None and len(self._fixes):
             for row, k in zip(self._fixes, self._whole.moments(gps.t_ns[self._fixes]).tolist(), strict=True):
@@ -335,7 +335,7 @@ class InitialState:
         return gps is not None and bool(np.isfinite(gps.sigma[self._fixes, 2]).any())
 
     def _know_height(self, rows: Rows, x: Array) -> None:
-        """Add the newest depths as one reading, their median; each, where the vertical way is unknown."""
+        """Add the median of the newest depths as one reading; or each depth, where the vertical path is unknown."""
         depth, parts, left = self._log.depth, [], []
         if depth is None or not len(self._depths):
             if not self._height_by_gps:
@@ -356,7 +356,7 @@ class InitialState:
     # --- heading by GPS ----------------------------------------------------------------------------------------------
 
     def _antenna(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return where the antenna was and where the fixes say it was, (n, 2) m, and their sigma (n,)."""
+        """Return the antenna's positions by the track and by the fixes, (n, 2) m, and the sigma of the latter."""
         gps = self._log.gps
         assert gps is not None
         moments = self._whole.moments(gps.t_ns[self._fixes]).tolist()
@@ -365,7 +365,7 @@ class InitialState:
         return p, gps.z[self._fixes, :2], np.hypot(gps.sigma[self._fixes, :2].max(axis=1), drift)
 
     def _first_yaw(self, x: Array) -> float:
-        """Return the yaw that lays the antenna's track onto the fixes, in the plane."""
+        """Return the yaw that fits the antenna's track to the fixes, in the plane."""
         p, z, sigma = self._antenna(x)
         track, fixes = (xy[:, 0] + 1j * xy[:, 1] for xy in (p, z))
         weight = sigma**-2 / np.sum(sigma**-2)
@@ -373,12 +373,12 @@ class InitialState:
         return float(x[YAW] + np.angle(weight @ product))
 
     def _misfit(self, x: Array) -> float:
-        """Return by how much the fixes lie further from the track than they should; 1 where chance may explain it."""
+        """Return the factor by which the residuals of the fixes exceed their sigma; 1 where chance may explain it."""
         p, z, sigma = self._antenna(x)
         total, dof = float(np.sum((p - z) ** 2 / sigma[:, None] ** 2)), 2 * len(p) - 3
         return float(np.sqrt(total / dof)) if dof > 0 and total > chi2.ppf(0.99, dof) else 1.0
 
-    # --- what comes out ----------------------------------------------------------------------------------------------
+    # --- the result ----------------------------------------------------------------------------------------------
 
     def _as_belief(self, x: Array, cov: Array) -> Belief:
         R_WB, w, A = attitude(x), self._window, np.zeros((DIM, UNKNOWNS))
@@ -399,61 +399,61 @@ class InitialState:
         state = NavState(R_WB, x[PLACE], v_WB_W, x[ACCEL], x[GYRO])
         return Belief(int(w.t_ns[-1]), state, P)
 
-    def _told(self, cov: Array) -> list[str]:
-        """Return how each part was got."""
+    def _notes(self, cov: Array) -> list[str]:
+        """Return sentences on how each part was found."""
         samples, fixes, depths = len(self._window.t_ns) - 1, len(self._fixes), len(self._depths)
         sigma_deg, length_s = np.degrees(np.sqrt(cov[YAW, YAW])), self._whole.length_s
         seen = f" and {self._levelled_by} DVL readings" if self._levelled_by else ""
-        told = [
+        notes = [
             f"moving: prior at {length_s:.2f} s; level from {samples} accelerometer samples{seen}, turned by the gyro"
         ]
         if self.at_rest:
-            told = [f"static: prior at {length_s:.2f} s, all at rest; level from {samples} accelerometer samples"]
-            told += ["gyro bias from its mean at rest, the Earth's rate being in its sigma"]
+            notes = [f"static: prior at {length_s:.2f} s, all at rest; level from {samples} accelerometer samples"]
+            notes += ["gyro bias from its mean at rest; its sigma includes the Earth's rate"]
         if self.heading == "sensor":
-            told += [f"heading from {len(self._headings)} readings, sigma {sigma_deg:.1f} deg (not averaged down)"]
+            notes += [f"heading from {len(self._headings)} readings, sigma {sigma_deg:.1f} deg (not averaged down)"]
         elif self.heading == "by GPS":
-            told += [f"heading from laying the track of gyro and DVL onto {fixes} fixes, sigma {sigma_deg:.1f} deg"]
+            notes += [f"heading from fitting the track of gyro and DVL to {fixes} fixes, sigma {sigma_deg:.1f} deg"]
         else:
-            told += ["no heading sensor heard, and no track laid onto fixes: heading unknown"]
+            notes += ["no readings of a heading sensor, and no track to fit to fixes: heading unknown"]
         if self._stretch > 1.0:
-            told += [f"the fixes lie {self._stretch:.1f} times further off the track than they should: sigma stretched"]
+            notes += [f"the residuals of the fixes are {self._stretch:.1f} times their sigma: sigma enlarged"]
         if self.at_rest:
-            told += ["velocity zero, at rest"]
+            notes += ["velocity zero, at rest"]
         elif self._knows_speed:
             unmeasured = [axis for axis, there in zip("xyz", self._measured, strict=True) if not there]
             but = f"; {', '.join(unmeasured)} of B not measured: unknown" if unmeasured else ""
-            told += [f"velocity from {self._levelled_by} DVL readings{but}"]
+            notes += [f"velocity from {self._levelled_by} DVL readings{but}"]
         elif fixes > 1:
-            told += [f"no DVL heard: velocity from {fixes} fixes"]
+            notes += [f"no DVL readings: velocity from {fixes} fixes"]
         else:
-            told += ["no DVL heard: velocity unknown, taken as zero"]
+            notes += ["no DVL readings: velocity unknown, taken as zero"]
         if fixes:
-            told += [f"position from {fixes} fixes" if fixes > 1 else "position from the last fix"]
+            notes += [f"position from {fixes} fixes" if fixes > 1 else "position from the last fix"]
         else:
-            told += ["position zero at the start by definition of W, and what was travelled since"]
+            notes += ["position zero at the start by definition of W, plus the distance travelled since"]
         if depths:
-            told += [f"height from {depths} depth readings"]
+            notes += [f"height from {depths} depth readings"]
         elif not self._height_by_gps:
-            told += ["no depth sensor heard: height unknown"]
-        return told
+            notes += ["no depth readings: height unknown"]
+        return notes
 
 
 def up(gravity_B: Array) -> Array:
-    """Return what is up, in B (3,)."""
+    """Return the unit vector that points up, in B (3,)."""
     return -gravity_B / np.linalg.norm(gravity_B)
 
 
 def tilt_by_gravity(gravity_B: Array) -> Array:
-    """Return the derivative (3, 3) of theta by what gravity is in B, that of the yaw being zero."""
+    """Return the derivative (3, 3) of theta by gravity in B; the yaw does not depend on it."""
     return skew(up(gravity_B)) / np.linalg.norm(gravity_B)
 
 
 def second_order(v_B: Array, V: Array, T: Array) -> Array:
-    """Return the covariance (3, 3), in B, of what is of second order in the velocity exp(θ) (v + e) in W.
+    """Return the covariance (3, 3), in B, of the second-order terms of the velocity exp(θ) (v + e) in W.
 
-    With e of covariance V and θ of T: that of θ × e, and of θ × (θ × v) / 2, which for a heading known to 5° takes more
-    off the velocity than a good DVL's noise. A turn takes off twice the velocity at most.
+    With e of covariance V and θ of T: that of θ × e, and of θ × (θ × v) / 2, which for a heading known to 5° changes
+    the velocity by more than a good DVL's noise. A rotation changes it by twice the velocity at most.
     """
     crossed = np.einsum("ijk,lmn,jm,kn->il", LEVI_CIVITA, LEVI_CIVITA, T, V)
     # E a aᵀ of a = θ (θ·v) − v (θ·θ), by the fourth moments of a normal θ

@@ -1,14 +1,14 @@
-"""The belief a log starts from, out of its own first seconds: what a navigator knows before casting off.
+"""The initial belief of a log, estimated from its first seconds.
 
-Biases are known by their turn-on sigmas. Level comes from the accelerometers: what they feel is the change of velocity,
-which the DVL sees, less gravity. Heading comes from the heading sensor; without one, from laying the track that gyro
-and DVL give onto GPS fixes. Position comes from GPS or from the definition of W's origin, height from pressure,
-velocity from the DVL or else from GPS. At rest the velocity is zero, and the gyro shows its bias. What nothing tells is
-wide, and said. How they are put together is told in `initial_state`.
+Biases are known by their turn-on sigmas. Level comes from the accelerometers, which measure the change of velocity
+(known from the DVL) less gravity. Heading comes from the heading sensor; without one, from fitting the track of gyro
+and DVL to GPS fixes. Position comes from GPS or from the definition of W's origin, height from pressure, velocity from
+the DVL or else from GPS. At rest the velocity is zero, and the gyro measures its bias. What no sensor measures gets a
+large sigma and a note. The least-squares problem is in `initial_state`.
 
-The belief stands at the end of the window (at the IMU sample there), and epochs begin after it, so no reading is used
+The belief is at the end of the window (at the IMU sample there), and epochs begin after it, so no reading is used
 twice. W's origin is the vehicle's place at the start of the log (for geodetic logs: its first fix at or after the
-start). So without GPS the position at the end of the window is what was travelled since the start.
+start). So without GPS the position at the end of the window is the distance travelled since the start.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from .rest import rest_s
 from .window import heard
 
 ALIGNED_RAD = np.radians(5.0)
-"""A heading by GPS is taken from this sigma on."""
+"""A heading by GPS is accepted once its sigma is below this."""
 WAY_M_S = 0.5
-"""A velocity by GPS is taken from this sigma on."""
+"""A velocity by GPS is accepted once its sigma is below this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Initialisation:
-    """A belief, and how it was got.
+    """A belief, and how it was found.
 
     Attributes:
-        start: "static" or "moving", and after a comma what is unusual: "heading by GPS", "heading unknown".
-        notes: in sentences, how each part of it was got.
+        start: "static" or "moving", and after a comma, if unusual: "heading by GPS", "heading unknown".
+        notes: sentences on how each part of it was found.
     """
 
     belief: Belief
@@ -45,20 +45,20 @@ class Initialisation:
 
 
 def initialise(log: Log, window_s: float = 2.0, max_wait_s: float = 10.0, max_align_s: float = 60.0) -> Initialisation:
-    """Make the belief at the end of the log's first seconds.
+    """Estimate the belief at the end of the log's first seconds.
 
     Args:
-        log: its truth and its prior are not looked at.
-        window_s: how long to listen.
-        max_wait_s: the window grows up to this while the vehicle rests; until the heading sensor and the DVL have been
-            heard; and, without a DVL, until GPS tells the velocity.
-        max_align_s: without a heading sensor it grows up to this, until GPS and the DVL tell the heading.
+        log: its truth and its prior are not used.
+        window_s: least length of the window.
+        max_wait_s: the window grows up to this while the vehicle rests; until the heading sensor and the DVL have
+            readings; and, without a DVL, until GPS gives the velocity.
+        max_align_s: without a heading sensor it grows up to this, until GPS and the DVL give the heading.
     """
     start_ns = int(log.imu.t_ns[0]) - log.imu.period_ns
     still_s = rest_s(log, start_ns, max(max_wait_s, window_s))
     if still_s >= window_s:
         end_ns = _sample_at(log, start_ns + round(still_s * 1e9))
-        return _said(InitialState(log, start_ns, end_ns, still_s, at_rest=True))
+        return _with_notes(InitialState(log, start_ns, end_ns, still_s, at_rest=True))
     end_ns = _end(log, start_ns, window_s, max_wait_s)
     has_dvl, has_heading = (len(heard(stream, start_ns, end_ns)) > 0 for stream in (log.dvl, log.heading))
     if not has_dvl:
@@ -67,16 +67,16 @@ def initialise(log: Log, window_s: float = 2.0, max_wait_s: float = 10.0, max_al
             state = InitialState(log, start_ns, later_ns, window_s)
             if state.belief.P[VELOCITY, VELOCITY].diagonal()[:2].max() < WAY_M_S**2:
                 break
-        return _said(state)
+        return _with_notes(state)
     if not has_heading:
         for later_ns in _fixes(log, end_ns, start_ns + round(max_align_s * 1e9)):
             state = InitialState(log, start_ns, later_ns, window_s, heading_by_gps=True)
             if state.yaw_sigma < ALIGNED_RAD:
-                return _said(state)
-    return _said(InitialState(log, start_ns, end_ns, window_s))
+                return _with_notes(state)
+    return _with_notes(InitialState(log, start_ns, end_ns, window_s))
 
 
-def _said(state: InitialState) -> Initialisation:
+def _with_notes(state: InitialState) -> Initialisation:
     start = "static" if state.at_rest else "moving"
     unusual = "" if state.heading == "sensor" else f", heading {state.heading}"
     return Initialisation(state.belief, start + unusual, tuple(state.notes))
@@ -100,7 +100,7 @@ def _sample_at(log: Log, t_ns: int) -> int:
 
 
 def _fixes(log: Log, after_ns: int, until_ns: int) -> Iterator[int]:
-    """Yield when to look whether GPS has told enough: as a fix comes, and a tenth later than the time before."""
+    """Yield the times at which to check whether GPS suffices: at a fix, then when the window is a tenth longer."""
     if log.gps is None:
         return
     start_ns = int(log.imu.t_ns[0]) - log.imu.period_ns

@@ -1,8 +1,9 @@
-"""How long a log begins at rest: its IMU is quiet, and other sensors say that it neither moves nor turns.
+"""Detection of rest at the start of a log: the IMU is quiet, and other sensors show no velocity and no rotation.
 
-A gyro cannot tell a slow even turn from its bias, nor an accelerometer steady way from rest. (Ictineu hovers with a
-DVL's zero velocity and a gyro's near zero rate, while its compass turns by 0.6 °/s: the gyro's bias happens to cancel
-it.) So a quiet IMU is not enough: somebody must say that the vehicle does not move, and somebody that it does not turn.
+A gyro cannot distinguish a slow steady turn from its bias, nor an accelerometer steady motion from rest.
+(Ictineu hovers with a DVL's zero velocity and a gyro's near zero rate, while its compass turns by 0.6 °/s: the gyro's
+bias happens to cancel it.) So a quiet IMU is not enough: another sensor must show zero velocity, and another a
+constant heading.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ REST_M_S = 0.01
 REST_RAD_S = 1e-3
 """The same in rotation: 0.06 °/s."""
 VOUCHES_M_S = 0.2
-"""A velocity known no better than this does not tell rest from way."""
+"""A velocity known no better than this cannot distinguish rest from motion."""
 SIGMAS = 3.5
 """Normal noise exceeds it once in 2,000."""
 
 
 def rest_s(log: Log, start_ns: int, longest_s: float, step_s: float = 1.0) -> float:
-    """Return how long the log is at rest from start_ns on, s, at most longest_s; 0.0 where it is not.
+    """Return for how long the log is at rest from start_ns on, s, at most longest_s; 0.0 if it is not.
 
     The first step_s in which rest is no longer found, and the one before it, in which it may have ended, do not count.
     """
@@ -43,7 +44,7 @@ def rest_s(log: Log, start_ns: int, longest_s: float, step_s: float = 1.0) -> fl
 
 
 def is_at_rest(log: Log, start_ns: int, end_ns: int) -> bool:
-    """Return whether nothing moves from start_ns to end_ns, and something says so."""
+    """Return whether the vehicle rests from start_ns to end_ns, as sensors of velocity and of heading confirm."""
     velocity = mean_velocity(log, start_ns, end_ns)
     if velocity is None or not is_quiet(log, start_ns, end_ns):
         return False
@@ -57,7 +58,7 @@ def is_at_rest(log: Log, start_ns: int, end_ns: int) -> bool:
 
 
 def is_quiet(log: Log, start_ns: int, end_ns: int) -> bool:
-    """Return whether the IMU shows no more than its own noise, and a turn-on bias of the gyro."""
+    """Return whether the IMU shows only its noise, and the gyro at most its turn-on bias."""
     imu, noise = log.imu, log.rig.imu_noise
     inside = (imu.t_ns > start_ns) & (imu.t_ns <= end_ns)
     dt_s, n = imu.period_ns * 1e-9, int(inside.sum())
@@ -92,9 +93,9 @@ def mean_velocity(log: Log, start_ns: int, end_ns: int) -> tuple[Array, Array] |
 
 
 def heading_rate(log: Log, start_ns: int, end_ns: int) -> tuple[float, float] | None:
-    """Return the rate of the heading sensor and its sigma (rad/s); None where it is hardly heard.
+    """Return the rate of the heading sensor and its sigma (rad/s); None if it has too few readings.
 
-    Its scatter about an even turn is its own: what is stated may allow for errors that stay the same for a while.
+    The scatter about a steady turn gives the sigma, since the stated sigma may include slowly varying errors.
     """
     rows = heard(log.heading, start_ns, end_ns)
     if log.heading is None or len(rows) < 4:

@@ -1,12 +1,12 @@
-"""A stretch of the IMU, seen from its end: how the body turned, and by how much it was pushed, until then.
+"""The IMU samples of an interval, integrated backwards from its end: rotation, and change of velocity.
 
-E is B at the end of the stretch. With φ(t) the rotation error that a gyro bias makes between t and the end, and γ what
-gravity is in E, the rotation at t, and the velocity u of the IMU in E axes, are to first order in the biases
+E is B at the end of the interval. With φ(t) the rotation error that a gyro bias makes between t and the end, and γ
+gravity in E, the rotation at t, and the velocity u of the IMU in E axes, are to first order in the biases
 
     R_EB(t) = Exp(φ) R̃_EB(t)        φ = Φ(t) b_g        Φ(t) = ∫_t R̃_EB R_BI dt
     u(t) = u − ∫_t (R_EB (f_B − R_BI b_a) + γ) dt = u − push + Φ b_a − push_bg b_g − γ · left
 
-At rest nothing turns, whatever the gyro says, and its bias turns nothing.
+At rest the rotation is zero by definition, so the gyro and its bias have no effect on it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from ...datasets.state import Array, TimeArray
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The moments of a stretch: its start, and the end of every IMU sample, split where an aiding reading was true.
+    """The times in an interval: its start, and the end of each IMU sample, split at the times of aiding readings.
 
     Attributes:
-        t_ns: (n,) moments.
-        left_s: (n,) s, from each moment to the end.
-        R_EB: (n, 3, 3), from B at each moment to B at the end, by the gyro.
-        w_WB_B: (n, 3) rad/s, of the sample that ends at each moment.
+        t_ns: (n,) times.
+        left_s: (n,) s, from each time to the end.
+        R_EB: (n, 3, 3), from B at each time to B at the end, by the gyro.
+        w_WB_B: (n, 3) rad/s, of the sample that ends at each time.
         held: Φ (n, 3, 3) s.
         turn: the derivative (n, 3, 3) s of φ by b_g: Φ, or zero at rest.
-        push: (n, 3) m/s, ∫ R̃_EB f_B dt from each moment to the end.
+        push: (n, 3) m/s, ∫ R̃_EB f_B dt from each time to the end.
         push_bg: (n, 3, 3) m, its derivative by b_g; that by b_a is −Φ.
     """
 
@@ -46,7 +46,7 @@ class Window:
 
     @classmethod
     def of(cls, log: Log, start_ns: int, end_ns: int, *, at_rest: bool = False) -> Window:
-        """Return the stretch from start_ns to end_ns."""
+        """Return the interval from start_ns to end_ns."""
         imu, R_BI = log.imu, np.asarray(log.rig.imu.R_BS)
         moments = [imu.t_ns, *(stream.t_ns for stream in log.streams.values()), np.array([start_ns, end_ns])]
         t_ns = np.unique(np.concatenate(moments))
@@ -75,18 +75,18 @@ class Window:
         return float(self.left_s[0])
 
     def heard(self, stream: ReadingStream | None) -> TimeArray:
-        """Return the rows of a stream that were true after the start, and known by the end."""
+        """Return the rows of a stream that were taken after the start and received by the end."""
         return heard(stream, int(self.t_ns[0]), int(self.t_ns[-1]))
 
     def moments(self, t_ns: TimeArray) -> TimeArray:
-        """Return the indices of moments."""
+        """Return the indices of times in t_ns."""
         return np.searchsorted(self.t_ns, t_ns)
 
     def way(self, v_WB_B: Array) -> tuple[Array, Array]:
-        """Return where B was, from where it ends (n, 3) m in E axes, and the derivative by b_g, (n, 3, 3).
+        """Return the position of B relative to its last one, (n, 3) m in E axes, and its derivative by b_g, (n, 3, 3).
 
         Args:
-            v_WB_B: (n, 3) m/s at the moments.
+            v_WB_B: (n, 3) m/s at the times.
         """
         dt_s = np.diff(self.t_ns)[:, None] * 1e-9
         v_E = np.einsum("nij,nj->ni", self.R_EB, v_WB_B)
@@ -95,14 +95,14 @@ class Window:
 
 
 def heard(stream: ReadingStream | None, start_ns: int, end_ns: int) -> TimeArray:
-    """Return the rows of a stream that were true after start_ns, and known by end_ns."""
+    """Return the rows of a stream that were taken after start_ns and received by end_ns."""
     if stream is None:
         return np.zeros(0, dtype=np.int64)
     return np.flatnonzero((stream.t_ns > start_ns) & (stream.received_ns <= end_ns))
 
 
 def to_the_end(steps: Array) -> Array:
-    """Return the sums of steps (n − 1, ...) from each of n moments to the last, (n, ...)."""
+    """Return the sums of steps (n − 1, ...) from each of n times to the last, (n, ...)."""
     sums = np.zeros((len(steps) + 1, *steps.shape[1:]))
     sums[:-1] = np.cumsum(steps[::-1], axis=0)[::-1]
     return sums

@@ -20,7 +20,7 @@ from .filter_pass import FilterOptions, FilterPass, Kalman
 class ErrorStateKalmanFilter(FilterOptions):
     """Error-state extended Kalman filter over (theta, p, v, b_a, b_g).
 
-    A late reading is put where it belongs, see `FilterPass`.
+    It rewinds and replays for late readings, see `FilterPass`.
     """
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:

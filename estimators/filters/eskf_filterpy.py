@@ -1,7 +1,7 @@
 """The error-state Kalman filter once more, on filterpy's `ExtendedKalmanFilter`: the readable reference of `eskf`.
 
-What filterpy filters is the error of the state that stands beside it, which is zero before every update; what it finds
-moves that state, and the error is zero again.
+filterpy estimates the error of a state that is kept outside of it. The error is zero before every update; afterwards
+it is added to the state and reset to zero.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ class FilterpyKalman(Kalman):
         if len(r):
             try:
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", LinAlgWarning)  # of an ill-conditioned S we judge ourselves
+                    warnings.simplefilter("ignore", LinAlgWarning)  # S is checked below
                     ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
                 np.linalg.cholesky(ekf.S)
-            except (np.linalg.LinAlgError, ValueError):  # scipy's way of saying that something is not finite
+            except (np.linalg.LinAlgError, ValueError):  # scipy raises it if something is not finite
                 return False
         state[0]["P"] = ekf.P
         inject(state, ekf.x)

@@ -1,7 +1,7 @@
-"""One pass of any filter of ours: from epoch to epoch, past outliers, and back where a reading comes late.
+"""One pass of any Kalman filter: steps through epochs, gates outliers, rewinds and replays for late readings.
 
-What a filter does within an epoch is a `Kalman`: it predicts and corrects. All that goes on around it is here, once, so
-that filters differ in their filtering alone.
+A filter is a `Kalman`, which predicts and corrects within an epoch. Everything around that is here, once for all
+filters.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from ..stages import clock, stage
 
 @dataclass(frozen=True)
 class FilterOptions:
-    """What every filter can be told.
+    """Options of every filter.
 
     Attributes:
         factors: the sensors it may use.
         inflate: factor on the stated sigma by sensor; also "gyro" and "accel".
         gate: probability by sensor, such as {gps: 0.999}. A reading whose normalised innovation squared, against the
-            state predicted before any reading of its epoch, is beyond that quantile of chi-square is left out and
-            counted. A filter that has gone wrong leaves out good readings too, and may never find back.
-        max_delay_s: how far back it can go for a late reading.
+            state predicted before any reading of its epoch, is beyond that quantile of chi-square is rejected and
+            counted. A filter that has drifted rejects good readings too, and may never recover.
+        max_delay_s: how far it can rewind for a late reading.
         merge_ns: a reading at most this much older than its epoch is taken as of its epoch, and counted.
         earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
@@ -51,20 +51,20 @@ class FilterOptions:
 
 
 class Kalman(ABC):
-    """What makes a filter: how it carries a STATE record (of length 1) over a motion, and corrects it, in place.
+    """A filter: predicts a STATE record (of length 1) over a motion, and corrects it by readings, in place.
 
-    Its P may be of any error it likes, as long as it can be said in ours. Either step may raise Diverged.
+    Its P may be of an error of its own, which `error_covariance` converts to ours. Either step may raise Diverged.
     """
 
     @abstractmethod
     def predict(
         self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
     ) -> None:
-        """Carry the state over IMU_SAMPLE rows; `before` is the one before them. Fills `block` with their motion."""
+        """Predict the state over IMU_SAMPLE rows; `before` is the one before them. Fills `block` with their motion."""
 
     @abstractmethod
     def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
-        """Correct by readings that are all true now; False where that is impossible."""
+        """Correct by readings of the present time; False if S or the state is unusable."""
 
     def error_covariance(self, state: NDArray[Any]) -> Array:
         """Return the covariance (15, 15) of our error state: P itself, unless the filter's error is another."""
@@ -95,8 +95,8 @@ class StagedKalman(Kalman):
         return self._kalman.error_covariance(state)
 
 
-class Lived(NamedTuple):
-    """An epoch that has been lived through, the state and the sample before it, and what the gates left out of it."""
+class PastEpoch(NamedTuple):
+    """A processed epoch, kept for replay: the state and the IMU sample before it, and the outliers counted in it."""
 
     epoch: Epoch
     state: NDArray[Any]
@@ -107,14 +107,14 @@ class Lived(NamedTuple):
 class FilterPass:
     """One pass of a filter.
 
-    A reading that comes late, by at most max_delay_s, is put where it belongs: the filter goes back to the state it had
-    then and lives through the epochs since once more. One that comes later still is counted and left out.
+    If a reading is late by at most max_delay_s, the filter rewinds to the state before it and replays the epochs since,
+    with the reading in its place. A reading that is later than that is counted and dropped.
 
     Args:
         config, prior, rig: as for `Estimator.begin`; the prior's P is already of the filter's own error.
         kalman: the filter.
-        lived: told of every epoch once it has been lived through, with the state at its end and the block that led
-            there; of those lived again, again.
+        on_epoch: called after each epoch with the epoch, the state at its end, and the block that led there; called
+            again for each replayed epoch.
     """
 
     def __init__(
@@ -123,19 +123,19 @@ class FilterPass:
         prior: Belief,
         rig: Rig,
         kalman: Kalman,
-        lived: Callable[[Epoch, NDArray[Any], NDArray[Any]], None] | None = None,
+        on_epoch: Callable[[Epoch, NDArray[Any], NDArray[Any]], None] | None = None,
     ) -> None:
         self.counts: Counter[str] = Counter({f"outliers_{sensor}": 0 for sensor in config.gate})
         self._config = config
         self._kalman = StagedKalman(kalman) if clock.running else kalman
-        self._lived = lived
+        self._on_epoch = on_epoch
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._widths = gate_widths(config.gate) if config.gate else None
         self._t_ns = prior.t_ns
         self._state = as_record(prior)
         self._before: NDArray[Any] | None = None
         self._block = np.zeros(1, BLOCK)
-        self._past: deque[Lived] = deque()
+        self._past: deque[PastEpoch] = deque()
 
     @property
     def rig(self) -> NDArray[Any]:
@@ -144,13 +144,13 @@ class FilterPass:
 
     def step(self, epoch: Epoch) -> None:
         """See `Pass.step`."""
-        # an epoch's readings stand in the order of their truth
+        # an epoch's readings are sorted by their own time
         if len(epoch.readings) and epoch.readings["t_ns"][0] != epoch.t_ns:
             age_ns = epoch.t_ns - epoch.readings["t_ns"]
             self.counts["merged"] += int(((age_ns > 0) & (age_ns <= self._config.merge_ns)).sum())
             if age_ns[0] > self._config.merge_ns:
-                epoch = self._go_back_for_late(epoch)
-        self._live(epoch)
+                epoch = self._replay(epoch)
+        self._advance(epoch)
 
     def belief(self) -> Belief:
         """See `Pass.belief`."""
@@ -158,16 +158,16 @@ class FilterPass:
         return with_rate_noise(Belief(self._t_ns, state, self._kalman.error_covariance(self._state)), self._rig)
 
     def finish(self) -> Trajectory | None:
-        """A filter has no hindsight."""
+        """Return None: a filter does not smooth."""
         return None
 
-    def _live(self, epoch: Epoch) -> None:
-        """Predict to the epoch's end, correct by its readings, and remember."""
+    def _advance(self, epoch: Epoch) -> None:
+        """Predict to the end of the epoch, correct by its readings, and keep it for replay."""
         if self._before is None:
             self._before = first_sample(epoch.imu, self._rig)
         outliers: Counter[str] = Counter()
         if self._config.max_delay_s > 0:
-            self._past.append(Lived(epoch, self._state.copy(), self._before, outliers))
+            self._past.append(PastEpoch(epoch, self._state.copy(), self._before, outliers))
             horizon_ns = epoch.t_ns - int(self._config.max_delay_s * 1e9)
             while self._past[0].epoch.t_ns < horizon_ns:
                 self._past.popleft()
@@ -176,16 +176,16 @@ class FilterPass:
             self._before = epoch.imu[-1:]
         readings = epoch.readings
         if self._widths is not None and len(readings):
-            readings = self._likely(readings, self._widths, outliers)
+            readings = self._gated(readings, self._widths, outliers)
             self.counts.update(outliers)
         if len(readings) and not self._kalman.correct(self._state, self._rig, readings):
-            raise Diverged("the innovation covariance is not positive, or the state is not finite")
-        if self._lived is not None:
-            self._lived(epoch, self._state, self._block)
+            raise Diverged("the innovation covariance is not positive definite, or the state is not finite")
+        if self._on_epoch is not None:
+            self._on_epoch(epoch, self._state, self._block)
         self._t_ns = epoch.t_ns
 
-    def _likely(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
-        """Return the readings that pass their gates, and count the others."""
+    def _gated(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
+        """Return the readings that pass their gates, and count the others as outliers."""
         predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
         predicted["P"][0] = self._kalman.error_covariance(self._state)
         judge(readings, predicted, self._rig, table)
@@ -195,28 +195,30 @@ class FilterPass:
         outliers.update(f"outliers_{SENSOR[kind]}" for kind in readings["kind"][beyond].tolist())
         return readings[~beyond]
 
-    def _go_back_for_late(self, epoch: Epoch) -> Epoch:
-        """Live through the past again with the epoch's late readings in it; return the epoch without them."""
+    def _replay(self, epoch: Epoch) -> Epoch:
+        """Rewind, and replay with the late readings of the epoch inserted; return the epoch without them."""
         is_late = epoch.readings["t_ns"] < epoch.t_ns - self._config.merge_ns
         late = epoch.readings[is_late]
         late = late[np.argsort(late["t_ns"], kind="stable")]
-        now = Lived(epoch._replace(readings=epoch.readings[~is_late]), self._state, self._before_or(epoch), Counter())
+        now = PastEpoch(
+            epoch._replace(readings=epoch.readings[~is_late]), self._state, self._before_or(epoch), Counter()
+        )
         past = [*self._past, now]
         began_ns = past[0].epoch.t_ns - round(float(past[0].epoch.imu["dt_s"].sum()) * 1e9)
         reachable = late[late["t_ns"] > began_ns]
         self.counts["late"] += len(late) - len(reachable)
         self.counts["replayed"] += len(reachable)
         if len(reachable):
-            first = next(i for i, lived in enumerate(past) if lived.epoch.t_ns >= reachable["t_ns"][0])
-            again = [lived.epoch for lived in past[first:]]
+            first = next(i for i, one in enumerate(past) if one.epoch.t_ns >= reachable["t_ns"][0])
+            again = [one.epoch for one in past[first:]]
             if first < len(past) - 1:
                 self._state, self._before = past[first].state.copy(), past[first].before
             for _ in again[:-1]:
                 self.counts.subtract(self._past.pop().outliers)
             for reading in reachable:
                 again = _insert(again, reading)
-            for lived_again in again[:-1]:
-                self._live(lived_again)
+            for replayed in again[:-1]:
+                self._advance(replayed)
             return again[-1]
         return now.epoch
 
@@ -225,7 +227,7 @@ class FilterPass:
 
 
 def _insert(epochs: list[Epoch], reading: Any) -> list[Epoch]:
-    """Return the epochs with `reading` in the last one of its time, splitting the one that it falls into."""
+    """Return the epochs with `reading` added to the last epoch of its time, or else to a new one, split off."""
     t_ns = int(reading["t_ns"])
     same_time = [i for i, epoch in enumerate(epochs) if epoch.t_ns == t_ns]
     k = same_time[-1] if same_time else next(i for i, epoch in enumerate(epochs) if epoch.t_ns > t_ns)

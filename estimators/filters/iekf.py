@@ -4,11 +4,11 @@ The equations are docs/conventions.md (39) to (43).
 
 Pose and velocity X = (R_WB, v_WB_W, p_WB_W) are one element of SE_2(3), and the error is on its left, in W:
 
-    X_true = Exp(xi) X        xi = (phi, rho, nu), rotation, position, velocity; biases are added, as ever
+    X_true = Exp(xi) X        xi = (phi, rho, nu), rotation, position, velocity; biases are added
 
-To first order phi = R theta, rho = p_error + p × phi and nu = v_error + v × phi. Two things come of it. The IMU block
-carries xi by a matrix that knows nothing of the state, exactly (Exp(xi_j) = Γ Exp(Φ xi_i) Γ⁻¹ with the block's gravity
-in Γ), and a DVL's velocity measures R_BW nu, whatever phi is: a wrong heading makes neither of them wrong. Only the
+To first order phi = R theta, rho = p_error + p × phi and nu = v_error + v × phi. This has two consequences. The IMU
+block carries xi by a matrix that does not depend on the state, exactly (Exp(xi_j) = Γ Exp(Φ xi_i) Γ⁻¹ with the block's
+gravity in Γ), and a DVL's velocity measures R_BW nu, independently of phi: a wrong heading affects neither. Only the
 biases' columns of the transition and the other sensors' rows still depend on the state.
 
 Where W turns (`earth_rotation`, see `imu`), phi turns with it, phi_j = E phi, and so do rho and nu; but v is over W,
@@ -17,7 +17,7 @@ not over the stars, and p is counted in W. With u' = p_j − p_i and positions f
     rho_j = rho + T E nu + (E [g₂]× + [p_i]× (E − I)) phi
     nu_j = (E − T Ω× E) nu + (E [g₁]× − Ω× E [g₂]× + [u']× Ω× E) phi
 
-The two terms in the state are a turn of the Earth in T of it: a wrong heading enters through them 1e-4 as much.
+The two terms that depend on the state are the Earth's rotation in T times it: a wrong heading enters by 1e-4 of it.
 
 Positions are counted from the prior's, for rho turns about the point that they are counted from: an unknown heading
 is then an unknown turn about where the vehicle began.

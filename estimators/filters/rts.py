@@ -6,7 +6,7 @@ its covariance, x⁻ = f(x_k) and P⁻ = F P_k Fᵀ + Q the prediction of epoch 
     G = P_k Fᵀ (P⁻)⁻¹        d = G Log(x⁻, x^S_k+1)        x^S_k = x_k ⊕ d
     P^S_k = P_k + G (P^S_k+1 − P⁻) Gᵀ
 
-Here P⁻ and P_k are of errors at x⁻ and x_k (the filter has settled its own reset when it handed P_k on); P^S_k+1 is of
+Here P⁻ and P_k are of errors at x⁻ and x_k (the filter has already applied its reset to P_k); P^S_k+1 is of
 errors at x^S_k+1, so it is carried to x⁻ by the inverse right Jacobian of the step between them, and P^S_k from x_k to
 x^S_k by the right Jacobian of d.
 """
@@ -36,11 +36,11 @@ from .filter_pass import FilterOptions, FilterPass
 TRIANGLE = DIM * (DIM + 1) // 2
 """Numbers in one half of a symmetric matrix."""
 PAGE = 1024
-"""Epochs for which memory is taken at a time."""
+"""Epochs for which memory is allocated at a time."""
 
 
 class Page:
-    """What is remembered of up to PAGE epochs, 2.4 kB each: F, Q and the prediction are found again from the block."""
+    """Storage of up to PAGE epochs, 2.4 kB each; F, Q and the prediction are recomputed from the block."""
 
     def __init__(self) -> None:
         self.t_ns = np.zeros(PAGE, np.int64)
@@ -52,7 +52,7 @@ class Page:
 
 @dataclass(frozen=True)
 class RauchTungStriebelSmoother(FilterOptions):
-    """`eskf` forwards, and backwards at the end; its beliefs on the way are those of `eskf`."""
+    """`eskf` forwards, then the backward pass at the end of the log; online its beliefs are those of `eskf`."""
 
     def begin(self, prior: Belief, rig: Rig) -> RauchTungStriebelPass:
         """See `Estimator.begin`."""
@@ -78,7 +78,7 @@ class RauchTungStriebelPass:
         return self._forwards.belief()
 
     def finish(self) -> Trajectory | None:
-        """Return the smoothed states at the ticks; what the forward pass took of memory is given back on the way."""
+        """Return the smoothed states at the ticks; the memory of the forward pass is freed page by page."""
         beliefs: list[Belief] = []
         later, block, rig = np.zeros(1, STATE), STANDSTILL.copy(), self._forwards.rig
         filled = self._length - PAGE * (len(self._pages) - 1)
@@ -88,7 +88,7 @@ class RauchTungStriebelPass:
             ticks = np.flatnonzero(page.tick[:filled])
             smoothed = np.zeros(len(ticks), STATE)
             if not smooth(page.mean, page.P, page.block, filled, page.tick, later, block, rig, smoothed):
-                raise Diverged("a predicted covariance is not positive")
+                raise Diverged("a predicted covariance is not positive definite")
             for k in range(len(ticks) - 1, -1, -1):
                 belief = as_belief(int(page.t_ns[ticks[k]]), smoothed[k : k + 1])
                 beliefs.append(with_rate_noise(belief, rig))
@@ -98,7 +98,7 @@ class RauchTungStriebelPass:
 
     @stage("output")
     def _remember_epoch(self, epoch: Epoch, state: NDArray[Any], block: NDArray[Any]) -> None:
-        """Write an epoch down; where nothing moved since the last one, as the same, later known better."""
+        """Store an epoch; one without IMU samples replaces the epoch before it, of the same time."""
         t_ns, tick = epoch.t_ns, epoch.tick
         if not len(epoch.imu):
             self._forget(t_ns + 1)
@@ -107,7 +107,7 @@ class RauchTungStriebelPass:
         self._remember(t_ns, tick, state, block)
 
     def _remember(self, t_ns: int, tick: bool, state: NDArray[Any], block: NDArray[Any]) -> None:
-        """Write a state down; where the filter has gone back for a late reading, over those that it lives again."""
+        """Store a state; a replayed epoch overwrites what was stored from its time on."""
         self._forget(t_ns)
         row = self._length % PAGE
         if row == 0:
@@ -118,7 +118,7 @@ class RauchTungStriebelPass:
         self._length += 1
 
     def _forget(self, t_ns: int) -> None:
-        """Strike out what was written down of t_ns and later."""
+        """Remove the states stored for t_ns and later."""
         while self._length and self._pages[-1].t_ns[(self._length - 1) % PAGE] >= t_ns:
             self._length -= 1
             if self._length % PAGE == 0:
@@ -126,7 +126,7 @@ class RauchTungStriebelPass:
 
 
 STANDSTILL = np.zeros(1, BLOCK)
-"""The block of no motion in no time."""
+"""The block of no motion, of zero duration."""
 STANDSTILL["dR"] = np.eye(3)
 
 
@@ -165,7 +165,7 @@ def smooth(
     mean: Array, P: Array, blocks: NDArray[Any], filled: int, tick: NDArray[np.bool_],
     later: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], out: NDArray[Any],
 ) -> bool:  # fmt: skip
-    """Smooth the epochs of one page, from the last to the first; False where that is impossible.
+    """Smooth the epochs of one page, from the last to the first; False if a prediction has a bad covariance.
 
     Args:
         mean, P, blocks, tick: the page's, of which the first `filled` rows count.

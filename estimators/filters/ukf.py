@@ -5,7 +5,7 @@ state, and the covariance is turned into its new tangent as after any update (`s
 integrated once, with the mean's biases, and carries all points, to first order in their difference in bias. Its noise
 Q is added (at the mean), as is a reading's.
 
-A residual is h ⊖ z at every point: yaws and attitudes wrap there, and nothing is left to average across a wrap.
+A residual is h ⊖ z at every point: yaws and attitudes are wrapped there, so no average is taken across a wrap.
 
 Sources: Julier & Uhlmann 2004, doi:10.1109/JPROC.2003.823141; Van der Merwe 2004 for the weights; Brossard, Barrau &
 Bonnabel 2017, doi:10.1109/IROS.2017.8206066, for retracting sigma points.
@@ -38,7 +38,7 @@ class UnscentedKalmanFilter(FilterOptions):
         alpha: the 31 points lie alpha √15 standard deviations out. At 1, a heading known to 60° has points at 232°,
             past where a rotation is a rotation vector; 1e-3, also common, cancels six digits of the covariance. From a
             good start 0.1 to 1 do the same.
-        beta: what the covariance's weight of the middle point knows of the fourth moments; 2 is a Gaussian's.
+        beta: adjusts the covariance weight of the central point for the fourth moments; 2 for a Gaussian.
     """
 
     alpha: float = Field(default=0.3, ge=1e-3, le=1)
@@ -88,16 +88,16 @@ class UnscentedKalman(Kalman):
         """Return the points (31, 15), errors about the state.
 
         Raises:
-            Diverged: P is no covariance.
+            Diverged: P is not positive definite.
         """
         try:
             return self._points.sigma_points(np.zeros(DIM), state[0]["P"])
         except np.linalg.LinAlgError:
-            raise Diverged("the covariance is not positive, and has no sigma points") from None
+            raise Diverged("the covariance is not positive definite, so it has no sigma points") from None
 
 
 def _upper_root(P: Array) -> Array:
-    """Return U with Uᵀ U = P, as filterpy wants it; raises LinAlgError where P is no covariance."""
+    """Return U with Uᵀ U = P, as filterpy wants it; raises LinAlgError if P is not positive definite."""
     return np.linalg.cholesky(P).T.astype(np.float64, copy=False)
 
 

@@ -53,7 +53,7 @@ class Keyframe:
         before: the IMU sample that ends at it.
         imu: samples from it to the next keyframe.
         next_ns: time of the next keyframe, if there is one.
-        doubted: factors on it under a loss, each with its sensor and the loss's width.
+        robust: factors on it under a loss, each with its sensor and the loss's width.
     """
 
     index: int
@@ -61,7 +61,7 @@ class Keyframe:
     before: NDArray[Any] | None
     imu: NDArray[Any]
     next_ns: int | None = None
-    doubted: list[tuple[str, Any, float]] = field(default_factory=list)
+    robust: list[tuple[str, Any, float]] = field(default_factory=list)
 
 
 class GraphPass:
@@ -192,7 +192,7 @@ class GraphPass:
             self._newest, self._solved, self._belief = state, new.index, None
 
     def _flush(self) -> None:
-        """Let the smoother have the factors of late readings that no keyframe has taken along."""
+        """Give the solver the factors of late readings that no keyframe has included."""
         if self._graph.size():
             self._solver.update(self._graph, gtsam.Values(), {})
             self._graph = gtsam.NonlinearFactorGraph()
@@ -216,7 +216,7 @@ class GraphPass:
         if loss is not None:
             limit = width(loss, rows(factor))
             factor = with_loss(factor, loss)
-            keyframe.doubted.append((SENSOR[kind], factor, limit))
+            keyframe.robust.append((SENSOR[kind], factor, limit))
         self._graph.add(factor)
 
     def _add_displacement(self, readings: NDArray[Any]) -> None:
@@ -274,13 +274,13 @@ class GraphPass:
         would lower the covariance; so between keyframes it is too large, that of velocity by 2 %.
         """
         for keyframe in keyframes:
-            if keyframe.doubted:
+            if keyframe.robust:
                 self._count_outliers(keyframe, gtsam.Values(new))
             until_ns = self._now_ns + 1 if keyframe.next_ns is None else keyframe.next_ns
             while self._ticks and self._ticks[0] < until_ns:
                 t_ns = self._ticks.popleft()
                 if t_ns >= self._covariance_due_ns:
-                    self._covariance_due_ns = t_ns + int(self._config.hindsight_covariance_s * 1e9)
+                    self._covariance_due_ns = t_ns + int(self._config.smoothed_covariance_s * 1e9)
                     belief = self._solver.belief(keyframe.index, keyframe.t_ns)
                 else:
                     belief = Belief(keyframe.t_ns, self._solver.state(keyframe.index), np.full((15, 15), np.nan))
@@ -288,7 +288,7 @@ class GraphPass:
 
     def _count_outliers(self, keyframe: Keyframe, values: gtsam.Values) -> None:
         """Count the factors on a keyframe whose residual exceeds the width of their loss."""
-        for sensor, factor, limit in keyframe.doubted:
+        for sensor, factor, limit in keyframe.robust:
             for i in {gtsam.Symbol(key).index() for key in factor.keys()}:  # noqa: SIM118 - a factor is no dict
                 if not values.exists(X(i)):
                     insert_state(values, i, self._solver.state(i), self._R_BI)

@@ -49,9 +49,9 @@ NO_BLOCK = np.zeros(1, BLOCK)
 ZERO, NO_BIAS = np.zeros(3), np.zeros(6)
 """For factors that do not depend on velocity or bias."""
 LEAST_WALK = 1e-4
-"""1/s: a bias must walk for GTSAM; by this much of the white noise nobody notices."""
+"""1/s: GTSAM needs a bias that walks; this fraction of the white noise has no visible effect."""
 INTEGRATION_DENSITY = 1e-5
-"""m/√s: GTSAM wants some; ten micrometres in a second keep a block of one sample regular."""
+"""m/√s: GTSAM needs some; ten micrometres in a second keep a block of one sample regular."""
 
 
 @compiled
@@ -440,8 +440,8 @@ def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array
         R_WB: the estimate's.
         R_BI: the IMU's mounting.
         R_WB_linearised: where the factors were linearised, if not at the estimate: iSAM2 leaves that be until a
-            variable has moved by a threshold. In the axes of this one a factor sees a position move, and a metre that
-            nothing has measured, seen in axes a hundredth of a radian off, would outweigh what depth says.
+            variable has moved by a threshold. A factor sees a position move in the axes of this
+            rotation: an unmeasured metre, in axes a hundredth of a radian off, would outweigh a depth reading.
     """
     R_at = R_WB if R_WB_linearised is None else R_WB_linearised
     G = np.zeros((DIM, DIM))
@@ -453,7 +453,7 @@ def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array
 
 @contextmanager
 def gtsam_failures() -> Iterator[None]:
-    """Turn what GTSAM throws into `Diverged`, on one line, its keys by name; after a throw a smoother is dead."""
+    """Turn what GTSAM throws into `Diverged`, on one line, its keys by name; the smoother is then unusable."""
     try:
         yield
     except Diverged:

@@ -86,7 +86,7 @@ class BatchFixedLagSmoother(LaggedSmoother, GtsamSmoother):
 class WholeLogSmoother(IncrementalSmoother):
     """MAP over the whole log, incrementally (GTSAM's iSAM2, nothing marginalised)."""
 
-    hindsight_covariance_s: Positive = 60.0
+    smoothed_covariance_s: Positive = 60.0
 
     @property
     def window_s(self) -> float:

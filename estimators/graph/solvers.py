@@ -1,4 +1,4 @@
-"""GTSAM's solvers behind one small interface: what a graph pass asks of them."""
+"""GTSAM's solvers behind one interface, `Solver`, for `graph_pass`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Thresholds = tuple[float, float, float, float]
 
 
 class Solver(Protocol):
-    """Takes factors and new keyframes in, and says what it believes of each keyframe that it still has."""
+    """Solves for the keyframes in its window, given factors."""
 
     def update(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[Any, Any]) -> None:
         """Add factors, and new variables with their times in seconds."""
@@ -60,7 +60,7 @@ def levenberg_marquardt_params(factorization: str) -> gtsam.LevenbergMarquardtPa
     """Return Levenberg–Marquardt's parameters; GTSAM's default, Cholesky, fails on IMU noise of a tactical grade.
 
     Its default bound on the damping, 1e5, is nothing beside information of 1e10: a reading that is far out would leave
-    it without a step that it may take, and standing still in silence.
+    it without an acceptable step, and it would stop without an error.
     """
     params = gtsam.LevenbergMarquardtParams()
     params.setlambdaUpperBound(1e30)
@@ -69,7 +69,7 @@ def levenberg_marquardt_params(factorization: str) -> gtsam.LevenbergMarquardtPa
 
 
 EDGE_S = 1e-3
-"""By so much a solver's window is longer than the lag: a state of just that age is still there to be asked for."""
+"""The solver's window is longer than the lag by this, so that a state of exactly that age can still be queried."""
 
 
 class IncrementalSolver:
@@ -180,7 +180,7 @@ def _estimate(source: Any, i: int, R_BI: Array) -> NavState:
 
 
 class BatchSolver(IncrementalSolver):
-    """iSAM2 while the log lasts, for a guess; in the end Levenberg–Marquardt over every factor there was.
+    """iSAM2 during the log, for an initial guess; at the end Levenberg–Marquardt over all factors.
 
     Covariances are iSAM2's, whose linearisation points are the optimum's within its thresholds, in the optimum's axes.
     """

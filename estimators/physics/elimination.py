@@ -18,9 +18,9 @@ from ...datasets.state import DIM, Array
 from .compiled import compiled, inner
 
 NO_VARIANCE = 1e-14
-"""Of a component's own variance: what is left of it below this, the others explain, to rounding."""
+"""Of a component's own variance: a remainder below this is explained by the other components, up to rounding."""
 NEGATIVE = -1e-9
-"""Of a component's own variance: what is left below this is no rounding; the matrix is no covariance."""
+"""Of a component's own variance: a remainder below this is not rounding: the matrix is not positive semi-definite."""
 
 
 @inner

@@ -23,7 +23,7 @@ block's start, i:
 
 An IMU senses its motion over the celestial frame C, the stars; W turns under it with the Earth, at Ω = w_CW_W (where
 `earth_rotation` says so; else Ω = 0). Over C, in the axes that W has at i and about the place that B has at i, all of
-this holds as it stands, lever arm included, but that gravity turns with W. Back over W, with E = Exp(−Ω T),
+this holds unchanged, lever arm included, except that gravity turns with W. Back over W, with E = Exp(−Ω T),
 
     R_j = E R_i ΔR        p_j = p_i + E u        v_j = E (v_i + g₁ + R_i Δv) − Ω × E u        u = v_i T + g₂ + R_i Δp
     g₁ = ∫ Exp(Ω t) g dt = g T + T²/2 Ω×g + T³/6 Ω×Ω×g        g₂ = ∫ g₁ dt = T²/2 g + T³/6 Ω×g + T⁴/24 Ω×Ω×g

@@ -20,7 +20,7 @@ INNOVATION = np.dtype(
         ("kind", "i8"),  # of the reading, as in READING
         ("t_ns", "i8"),  # when it was true
         ("dof", "i8"),  # components it measured
-        ("nis", "f8"),  # normalised innovation squared: of an honest belief, chi-square with dof degrees of freedom
+        ("nis", "f8"),  # normalised innovation squared: for a consistent belief, chi-square with dof degrees of freedom
     ]
 )
 
@@ -29,7 +29,7 @@ def gate_widths(gate: Mapping[str, float]) -> Array:
     """Return the largest NIS that passes, (kinds, 4), by kind of reading and its degrees of freedom.
 
     Args:
-        gate: probability by sensor; what is not named always passes.
+        gate: probability by sensor; a sensor that is not named always passes.
     """
     from scipy.stats import chi2  # a third of what importing the estimators would take, and only gates need it
 

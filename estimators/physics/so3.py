@@ -19,7 +19,7 @@ SMALL = 1e-4
 
 # Products of matrices and vectors are loops: for three components a call of BLAS costs more than the product,
 # and loops compile faster than the same sums written out, and than expressions of arrays and slices.
-# Functions named `..._into` write to an array of the caller's, which is none of the others.
+# Functions named `..._into` write to an array of the caller's, which must not be one of the inputs.
 
 
 @compiled

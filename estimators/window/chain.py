@@ -27,11 +27,11 @@ from ..physics.state import symmetrise
 
 NODE = np.dtype(
     [
-        # what a back-substitution reads lies together
+        # the fields that a back-substitution reads are adjacent
         ("Gt", "f8", (DIM, DIM)),  # Gᵀ
-        ("m", "f8", (DIM,)),  # what all that is older, and its own rows, say of it
-        ("m_given", "f8", (DIM,)),  # what all that is older says of it
-        ("d", "f8", (DIM,)),  # with all there is: the increment
+        ("m", "f8", (DIM,)),  # mean given its own rows and everything older
+        ("m_given", "f8", (DIM,)),  # mean given everything older
+        ("d", "f8", (DIM,)),  # the increment: mean given everything
         ("t_ns", "i8"),
         ("imu_from", "i8"),  # first of the samples since
         ("first", "i8"),  # of its factors; -1 for none
@@ -123,7 +123,7 @@ def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
 
 @compiled
 def smooth_covariances(nodes: NDArray[Any], low: int, newest: int) -> None:
-    """Fill P_smoothed, the covariance of δ given all there is, of keyframes newest down to low; eq. (9)."""
+    """Fill P_smoothed, the covariance of δ given everything, of keyframes newest down to low; eq. (9)."""
     mask, gained = len(nodes) - 1, np.empty((DIM, DIM))
     copy_into(nodes[newest & mask].P[:], nodes[newest & mask].P_smoothed[:])
     for k in range(newest - 1, low - 1, -1):

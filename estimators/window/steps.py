@@ -3,7 +3,7 @@
     extend      close an interval, predict the next keyframe, and put the readings that go with it among the factors
     linearise   what is new, and anew what has moved                                                   eq. (1) to (4)
     solve       eliminate from the oldest keyframe that changed to the newest, and substitute back     eq. (5) to (8)
-    forget      let the oldest keyframes go; what they said of the next one is there already                 eq. (10)
+    forget      drop the oldest keyframes; the prior of the next one is already computed                     eq. (10)
 
 Numba optimises a function together with all that it calls, and again with each of its callers: so the tree of calls is
 flat, and a function takes the arrays that it needs, not all there are.
@@ -27,15 +27,15 @@ from .chain import absorb_joint_row, back_substitute, copy_into, cross_tie
 from .factors import distance, linearise_factor, linearise_prior, linearise_tie
 
 NO_ROOM = -1
-"""What `extend` answers where keyframes, factors or samples might find no room; nothing is done then."""
+"""Returned by `extend` if keyframes, factors or samples might not fit; nothing is done then."""
 SOLVED, NOT_POSITIVE, NOT_FINITE = range(3)
-"""What a solve answers."""
+"""Status of a solve."""
 CAUSES = {
-    NOT_POSITIVE: "an innovation's or a predicted state's covariance is not positive",
+    NOT_POSITIVE: "an innovation's or a predicted state's covariance is not positive definite",
     NOT_FINITE: "the newest position is not finite",
 }
 CONVERGED = 1e-6
-"""Of a sigma: what moves by less has not moved; a thousandth of what any table of results shows."""
+"""As a share of a sigma: a smaller increment counts as none; a thousandth of what any table of results shows."""
 MOST_ITERATIONS = 100
 """Gauss–Newton steps to an optimum; recorded logs take 4 to 12."""
 
@@ -300,7 +300,7 @@ def forget(
     w: Records, nodes: Records, points: Records, factors: Records, anchor: Records,
     oldest: int,
 ) -> None:  # fmt: skip
-    """Marginalise the keyframes before `oldest` out; what they said of it becomes its prior, at the anchor."""
+    """Marginalise out the keyframes before `oldest`; their information becomes its prior, at the anchor."""
     v, mask = w[0], len(nodes) - 1
     count_outliers(w, nodes, factors, oldest)
     for k in range(v.oldest, oldest):

@@ -122,7 +122,7 @@ class WindowPass:
     def finish(self) -> Trajectory | None:
         """See `Pass.finish`. States still in the window have seen less than the lag."""
         if self._lost:
-            raise Diverged("the estimate was lost before the end")
+            raise Diverged("the estimate diverged before the end")
         if not self._begun:
             return None
         self._follow(self._keyframes.finish())
@@ -243,7 +243,7 @@ class WindowPass:
             a = k & mask
             node, state = self._nodes[a], self._points[a : a + 1].copy()
             if t_ns >= self._covariance_due_ns:
-                self._covariance_due_ns = t_ns + self._config.hindsight_covariance_s * 1e9
+                self._covariance_due_ns = t_ns + self._config.smoothed_covariance_s * 1e9
                 if not self._swept:
                     self._smooth_covariances(k, newest - 1)
                 state["P"] = node["P_smoothed"]

@@ -70,7 +70,7 @@ def test_all_logs_go_through_one_experiment_and_a_format_changes_no_score(
     assert result.exit_code == 0, result.output[-2000:]
     rows = load_runs(tmp_path / "out" / "formats")
     assert set(rows["status"]) == {"done"}
-    assert len(rows) == 3 * (len(written) + len(recorded))  # online twice, and the hindsight of fls
+    assert len(rows) == 3 * (len(written) + len(recorded))  # two estimators online, and fls smoothed
     ate = rows.pivot_table(index="log", columns=["label", "output"], values="ate_rmse_m")
     assert len(recorded) >= 4
     ours = ate.loc["parquet"]

@@ -21,7 +21,7 @@ LONGEST_S = 300
 
 
 def block(kind: str, holding: str) -> str:
-    """Return the one block of this kind that holds some text, as it stands on the page."""
+    """Return the one block of this kind that holds some text, as on the page."""
     found = [text for text in re.findall(rf"```{kind}\n(.*?)```", TEXT, re.DOTALL) if holding in text]
     assert len(found) == 1
     return found[0]

@@ -1,4 +1,4 @@
-"""A log is cut as a vehicle lives through it: by reception, exactly covered by the IMU, and without a look ahead."""
+"""A log is cut into epochs by time of reception, exactly covered by the IMU, and without a look ahead."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def test_the_height_of_the_reference_is_that_of_the_depth_sensor(lauv):
     assert np.abs(z - lauv.depth.z[:, 0]).max() < 0.05
 
 
-def test_the_reference_moves_as_its_own_velocity_says(lauv):
+def test_the_reference_moves_by_its_own_velocity(lauv):
     truth = lauv.truth
     assert truth is not None
     assert truth.v_WB_W is not None

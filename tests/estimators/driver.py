@@ -33,7 +33,7 @@ class Driven:
     Attributes:
         status: "done", or "diverged" where it raised Diverged, with the cause and the time, s from the start.
         online: the beliefs at the ticks, with no delay.
-        smoothed: the same states with hindsight; None where the estimator has none.
+        smoothed: the smoothed states; None where the estimator has none.
         counts: what happened to readings, gaps and solvers, by name.
     """
 

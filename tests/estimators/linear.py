@@ -125,8 +125,8 @@ SEEDS = [0, 1]
 
 
 def options(name: str, thorough: bool) -> dict[str, object]:
-    """As shipped, but for the lag and covariances at every tick; or linearising anew and carrying on whatever moves."""
-    wanted: dict[str, object] = {"lag_s": 0.2 * LAG, "hindsight_covariance_s": 1e-3}
+    """As shipped, but for the lag and covariances at every tick; or relinearising everything that moves."""
+    wanted: dict[str, object] = {"lag_s": 0.2 * LAG, "smoothed_covariance_s": 1e-3}
     if thorough:
         wanted |= {"relinearize": [1e-9] * 4, "wildfire": 0.0}
     return {key: value for key, value in wanted.items() if key in ESTIMATORS[name].__dataclass_fields__}
@@ -146,7 +146,7 @@ def exact(seed: int, seen: int) -> list[Belief]:
 
 @cache
 def run(name: str, seed: int, thorough: bool = False) -> tuple[list[Belief], list[Belief]]:
-    """The beliefs at the end of each epoch, and those with hindsight if there are any."""
+    """The beliefs at the end of each epoch, and the smoothed ones if there are any."""
     prior, epochs = toy(seed)
     one, online = create(name, **options(name, thorough)).begin(prior, SMOOTHERS_RIG), []
     for epoch in epochs:

@@ -25,7 +25,7 @@ SEEDS = 50
 EPOCHS_S = np.arange(3, 60, 6)
 SMALL = {"depth_m": 5.0, "shallow_m": 1.0, "leg_m": 15.0, "turn_radius_m": 5.0, "surface_for_s": 20.0}
 SENSORS = {"dvl": DvlSpec(2.5), "depth": DepthSpec(5.0), "heading": HeadingSpec(2.5)}
-AT_EVERY_TICK = {"hindsight_covariance_s": 1e-3}
+AT_EVERY_TICK = {"smoothed_covariance_s": 1e-3}
 
 
 @cache

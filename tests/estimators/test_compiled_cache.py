@@ -79,7 +79,7 @@ def test_a_second_clone_and_a_changed_comment_compile_nothing(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_where_no_folder_can_be_written_a_temporary_one_is_used_and_said(tmp_path: Path) -> None:
+def test_where_no_folder_can_be_written_a_temporary_one_is_used_with_a_warning(tmp_path: Path) -> None:
     copy_of_the_package(tmp_path)
     blocked = tmp_path / "blocked"
     blocked.write_text("a file where the folder would be")

@@ -48,7 +48,7 @@ def test_a_heading_alone_leaves_roll_and_pitch_level() -> None:
     assert np.abs(np.angle(np.exp(1j * (yaw[0] - yaw[1])))).max() < np.radians(2.0)
 
 
-def test_it_keeps_no_covariance_and_has_no_hindsight() -> None:
+def test_it_keeps_no_covariance_and_has_no_smoothed_states() -> None:
     result = run_log(simulate(replace(FAST, duration_s=20.0), seed=1), create("dead-reckoning"))
     assert result.online.P is None
     assert result.smoothed is None

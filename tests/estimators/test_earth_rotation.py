@@ -1,4 +1,4 @@
-"""With `earth_rotation` an estimator knows that the Earth turns: it returns to the truth, is honest, and finds north.
+"""With `earth_rotation` an estimator models the Earth's rotation: it returns to truth, is consistent, and finds north.
 
 Where the effect of one block is small beside a sigma, the Earth turns SPIN times too fast (simulator and rig take their
 rate from the same place), or W at a rate of its own.
@@ -41,7 +41,7 @@ NAVIGATION = IMU_GRADES["navigation"]
 OPTION = {"earth_rotation": True}
 
 
-# -- who is told of it ------------------------------------------------------------------------------------------------
+# -- where it is set --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -230,7 +230,7 @@ def test_ten_noise_free_minutes_on_a_turning_earth_return_to_the_truth(
 
 
 @pytest.mark.parametrize("latitude_deg", [0.0, 52.0, -75.0])
-def test_at_rest_the_earth_displaces_who_does_not_know_of_it_by_the_closed_form(latitude_deg: float) -> None:
+def test_at_rest_the_earth_displaces_an_estimator_that_ignores_it_by_the_closed_form(latitude_deg: float) -> None:
     """The attitude turns away at Ω, and with it the specific force: ∬ (Exp(Ω t) − 1) (0, 0, g) dt², 26 km · cos φ.
 
     Who knows stays, but for the centrifugal force of the lever arm, which `imu` says is left out.
@@ -325,7 +325,7 @@ def test_all_estimators_are_one_on_a_turning_earth(spun: Log, name: str, options
 
 
 @pytest.mark.parametrize("options", [{}, {"keyframe_period_s": 2.0}], ids=str)
-def test_with_hindsight_too(spun: Log, options: dict[str, float]) -> None:
+def test_smoothed_too(spun: Log, options: dict[str, float]) -> None:
     assert apart(spun, "batch", "rts", "smoothed", **options) < 0.1
 
 
@@ -343,7 +343,7 @@ def test_a_smoother_at_long_intervals_stays_at_the_truth(name: str, dvl: str, mo
     assert np.abs(error / sigma).max() < 1.0
 
 
-# -- honesty ----------------------------------------------------------------------------------------------------------
+# -- consistency ------------------------------------------------------------------------------------------------------
 
 SEEDS = 20
 EPOCHS_S = np.array([10, 20, 30, 40, 50, 60])
@@ -357,7 +357,7 @@ def small_mission(seed: int) -> Log:
 def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     """By part of the state: NEES summed over the seeds, at each epoch, per degree of freedom."""
     known = ESTIMATORS[name].__dataclass_fields__
-    every_tick = {"hindsight_covariance_s": 1e-3} if "hindsight_covariance_s" in known else {}
+    every_tick = {"smoothed_covariance_s": 1e-3} if "smoothed_covariance_s" in known else {}
     estimator, sums = create(name, earth_rotation=knows, **every_tick), {}
     for seed in range(SEEDS):
         log = small_mission(seed)
@@ -380,7 +380,7 @@ def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
         ("fls", "online"),
     ],
 )
-def test_the_navigation_grade_is_honest_only_for_who_knows(name: str, output: str) -> None:
+def test_a_navigation_grade_imu_is_consistent_only_with_earth_rotation(name: str, output: str) -> None:
     for part, found in summed_nees(name, output, knows=True).items():
         dof = SEEDS * len(np.arange(15)[BLOCKS[part]])
         low, high = np.array(chi2.interval(1 - 0.001 / len(EPOCHS_S), dof)) / dof
@@ -434,7 +434,7 @@ def moored(seed: int, latitude_deg: float) -> tuple[Rig, Belief, NavState, list[
         pytest.param("batch", 45.0, 3, marks=pytest.mark.slow),
     ],
 )
-def test_at_rest_the_earth_tells_north(name: str, latitude_deg: float, seeds: int) -> None:
+def test_at_rest_the_earths_rate_gives_north(name: str, latitude_deg: float, seeds: int) -> None:
     """Ω cos φ points north. A heading that is wrong by ψ is an eastward rate of Ω cos φ ψ, which is seen as tilting.
 
     What limits it is the gyro: its bias, b, and after T seconds what its noise, of density N, averages to:
@@ -446,9 +446,9 @@ def test_at_rest_the_earth_tells_north(name: str, latitude_deg: float, seeds: in
         run = create(name, **OPTION).begin(prior, rig)
         for epoch in epochs:
             run.step(epoch)
-        beliefs, hindsight = [run.belief()], run.finish()
-        if name in ("rts", "batch"):  # with hindsight north is known from the beginning
-            beliefs.append(Belief(0, hindsight.state(0), hindsight.P[0]))
+        beliefs, smoothed = [run.belief()], run.finish()
+        if name in ("rts", "batch"):  # smoothed, north is known from the beginning
+            beliefs.append(Belief(0, smoothed.state(0), smoothed.P[0]))
         for belief in beliefs:
             R_WB = belief.state.R_WB
             errors.append(Rotation.from_matrix(R_WB @ truth.R_WB.T).as_rotvec()[2])

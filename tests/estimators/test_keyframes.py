@@ -1,4 +1,4 @@
-"""Keyframes: which reading makes one, and where every reading goes, told against a plain list of rules."""
+"""Keyframes: which reading makes one, and where every reading goes, compared with a plain list of rules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wheel speed is a velocity sensor of one axis: the others are left out, by everybody, whatever stands there."""
+"""Wheel speed is a velocity sensor of one axis: all estimators ignore the others, whose values are arbitrary."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_what_stands_in_an_axis_that_is_not_measured_has_no_influence(label, pat
 )
 def test_no_measurement_is_the_limit_of_a_poor_one(label, pattern):
     """But of a sum of velocities, in which a poor axis drowns the others; of a loss, whose width goes by the axes; and
-    of dead reckoning, which believes whatever has a sigma."""
+    of dead reckoning, which uses every value that has a sigma."""
     none, poor = said(label, pattern), said(label, pattern, 1e6, None)
     for output, trajectory in none.outputs.items():
         other = poor.outputs[output]
@@ -129,7 +129,7 @@ def test_readings_with_an_axis_unmeasured_are_not_summed():
 
 
 @pytest.mark.parametrize("label", RECKONERS)
-def test_dead_reckoning_goes_where_its_nose_says(label):
+def test_dead_reckoning_goes_where_its_nose_points(label):
     online = said(label, "wheel").online
     v_B = np.einsum("nji,nj->ni", online.R_WB, online.v_WB_W)
     np.testing.assert_allclose(v_B[:, 1:], 0, atol=1e-12)

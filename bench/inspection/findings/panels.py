@@ -1,4 +1,4 @@
-"""How panels of the page look: one colour per stream, and no more points than a page can show."""
+"""Style of the page's panels: one colour per stream, and no more points than a page can show."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Channel:
 
     @property
     def period_s(self) -> float:
-        """Median interval; NaN where there is none."""
+        """Median interval; NaN with fewer than two values."""
         return float(np.median(np.diff(self.t_ns))) * 1e-9 if len(self.t_ns) > 1 else float("nan")
 
     @property

@@ -115,7 +115,7 @@ def _missing(channel: Channel, missing: MissingRows) -> list[Finding]:
 
 
 def _between(good: Array, bad: Array) -> float | None:
-    """Return a round bound that separates the good sizes from the bad ones; None if there is none."""
+    """Return a round bound that separates the good sizes from the bad ones; None if no bound does."""
     if not len(good) or not len(bad) or 1.2 * good.max() >= bad.min():
         return None
     low, high = max(float(good.max()), 1e-12), float(bad.min())

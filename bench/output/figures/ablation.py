@@ -1,4 +1,4 @@
-"""What each variant changes: its scores over its baseline's as bars with intervals; a figure per baseline's log."""
+"""The effect of each variant: its scores over its baseline's as bars with intervals; a figure per baseline's log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Are covariances consistent? NEES over time, averaged over seeds, with its chi-square intervals."""
+"""Consistency of covariances: NEES over time, averaged over seeds, with its chi-square intervals."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ FEWEST_LAGS = 3
 
 
 def lag_curve(summary: Sequence[Record]) -> str | None:
-    """Return the estimator that one log's records hold at three lags or more; None where there is none."""
+    """Return the estimator that one log's records hold at three lags or more; None if no estimator does."""
     for (name,), of_name in groups(summary, "estimator").items():
         lags = [row["lookahead_s"] for row in of_name if row["output"] == SMOOTHED]
         if len(lags) == len(set(lags)) >= FEWEST_LAGS:  # two variants at one lag are no curve

@@ -1,4 +1,4 @@
-"""What the page draws besides tracks: accuracy against cost, and NEES over the log; and how each estimator looks."""
+"""Figures of the page besides tracks: accuracy against cost, and NEES over the log; and how each estimator looks."""
 
 from __future__ import annotations
 

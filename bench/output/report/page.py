@@ -1,4 +1,4 @@
-"""The page: what an experiment found, in the order in which a reader asks, in one file that needs no network."""
+"""The HTML page of an experiment's results: one file that needs no network."""
 
 from __future__ import annotations
 

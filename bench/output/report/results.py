@@ -59,7 +59,7 @@ def kept_plan(folder: Path, name: str) -> tuple[Experiment | None, str | None]:
 
 
 def _load(source: str | Path) -> Experiment | None:
-    """Return an experiment; None if there is none, or if another version wrote it."""
+    """Return an experiment; None if the file is missing, or if another version wrote it."""
     try:
         return Experiment.load(source)
     except ExperimentError:

@@ -1,4 +1,4 @@
-"""What was run: how it ended, from which spec, where and by which versions."""
+"""The runs on the page: how each ended, its spec, machine and versions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the page draws of trajectories: of every log some seeds, of every track every k-th pose."""
+"""Trajectories on the page: some seeds of every log, every k-th pose of every track."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What running stored runs again gave, on the terminal."""
+"""The terminal output of `fathom reproduce`: repeated runs against stored ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where tables are printed: as wide as the terminal, and 120 columns where there is none."""
+"""The console for tables: as wide as the terminal, or 120 columns without a terminal."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def test_a_failed_run_is_named_on_the_last_line_and_exits_1(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_recording_that_is_not_here_is_said_plainly(tmp_path: Path) -> None:
+def test_a_recording_that_is_not_here_is_reported_plainly(tmp_path: Path) -> None:
     logs = "[{scenario: {duration_s: 20}}, {log: ictineu_stpere_2004}]"
     file = write(tmp_path, logs=logs, estimators="[{name: dead-reckoning}]")
     code, out, _ = call("run", file, "--out", tmp_path, "--data", tmp_path, "--jobs", 1)
@@ -183,7 +183,7 @@ def test_a_simulated_folder_runs_like_any_log(tmp_path: Path) -> None:
     assert out.startswith("dive")
 
 
-def test_a_simulated_log_without_sensors_is_told_as_it_is(tmp_path: Path) -> None:
+def test_a_simulated_log_without_sensors_is_described(tmp_path: Path) -> None:
     off = ", ".join(f"{sensor}: null" for sensor in ("dvl", "depth", "gps", "heading"))
     (tmp_path / "blind.yaml").write_text(f"{{duration_s: 20, {off}}}\n")
     code, out, _ = call("simulate", tmp_path / "blind.yaml", "-o", tmp_path / "blind")

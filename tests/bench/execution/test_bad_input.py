@@ -66,7 +66,7 @@ def without_imu(log: Log, from_s: float, to_s: float) -> Log:
 
 
 def assert_sound(result: Result, ticks: int = 20) -> Trajectory:
-    """The run came to its end, with a finite belief at every tick, and a covariance unless there is none at all."""
+    """The run finished, with a finite belief at every tick, and a covariance unless the estimator keeps none."""
     assert result.status == "done", result.cause
     online = result.online
     assert online is not None
@@ -91,7 +91,7 @@ def apart_in_sigma(a: Trajectory, b: Trajectory) -> float:
 
 @every
 @pytest.mark.parametrize("absent", [["dvl"], ["depth"], ["gps"], ["heading"], SENSORS], ids="+".join)
-def test_without_a_sensor_it_runs_on_and_knows_less(
+def test_without_a_sensor_it_runs_on_and_is_less_certain(
     log: Log, usual: Callable[[str], Result], name: str, absent: list[str]
 ) -> None:
     online = assert_sound(run_log(replace(log, **dict.fromkeys(absent)), create(name)))
@@ -138,7 +138,7 @@ def test_a_short_imu_gap_is_bridged_counted_and_costs_certainty(log: Log, name: 
 
 
 @every
-def test_too_long_an_imu_gap_ends_the_run_where_it_begins_and_keeps_what_was_said(log: Log, name: str) -> None:
+def test_too_long_an_imu_gap_ends_the_run_where_it_begins_and_keeps_the_beliefs_before(log: Log, name: str) -> None:
     result = run_log(without_imu(log, 10.01, 13.0), create(name))
     assert result.status == "failed"
     assert result.cause.startswith("imu gap at 10.000 s: 3.0")

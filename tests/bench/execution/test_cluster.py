@@ -1,4 +1,4 @@
-"""A cluster does what the local workers do: the same rows, bit for bit, whatever becomes of its workers."""
+"""A cluster does what the local workers do: the same rows, bit for bit, even if workers are lost."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def tasks_at(dask_scheduler: Any) -> list[str]:
 
 
 def holds_a_process() -> bool:
-    return remote._Held.worker is not None
+    return remote._SweepWorker.worker is not None
 
 
 def assert_nothing_is_left(client: Client) -> None:
@@ -155,7 +155,7 @@ def assert_nothing_is_left(client: Client) -> None:
 
 
 def assert_same(rows: pd.DataFrame, others: pd.DataFrame) -> None:
-    """Of two stores: bit for bit, what does not tell the time."""
+    """Compare two stores bit for bit, except for times."""
     names = ["log", "label", "seed", "status", "identity", "counts", "trajectory", "truth_trajectory", *SCORES]
     pd.testing.assert_frame_equal(rows[names], others[names], check_exact=True)
 

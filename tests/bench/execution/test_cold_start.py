@@ -55,7 +55,7 @@ def test_what_differs_in_numbers_runs_on_the_same_code() -> None:
     assert "depth" in code_of(create("eskf"))
 
 
-def test_the_first_time_is_told_once_and_the_second_time_nothing_is_done(
+def test_the_first_time_is_reported_once_and_the_second_time_nothing_is_done(
     folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     wanted = [create("eskf"), create("window", lag_s=3.0), create("window", lag_s=10.0)]
@@ -88,7 +88,7 @@ def test_what_a_dead_process_left_undone_is_left_to_the_workers(folder: Path, mo
     assert warm() == {code_of(create("eskf"))}
 
 
-def test_a_cache_that_cannot_be_written_stops_nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_cache_that_cannot_be_written_stops_no_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(cold_start, "_stamp", lambda: tmp_path / "no" / "such" / "folder.txt")
     remember("eskf")
     assert warm() == set()

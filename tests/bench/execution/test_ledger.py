@@ -66,7 +66,7 @@ def test_what_is_done_is_not_done_again_until_forced(tmp_path: Path, ran: list[s
     assert len(load_runs(tmp_path / "t")) == 3
 
 
-def test_a_changed_option_or_score_makes_a_new_run_and_says_so(tmp_path: Path, ran: list[str]) -> None:
+def test_a_changed_option_or_score_makes_a_new_run_and_is_reported(tmp_path: Path, ran: list[str]) -> None:
     run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
     changed = [{"name": "dead-reckoning", "with": {"attitude": "gyro"}}]
     outcome = sweep(experiment(seeds=[1, 2], estimators=changed), out=tmp_path)
@@ -158,7 +158,7 @@ def test_a_store_of_another_version_is_refused_before_anything_runs(tmp_path: Pa
     assert len(ran) == 1
 
 
-def test_the_log_with_the_least_work_goes_first_and_its_rows_are_told_when_its_last_run_has_ended(
+def test_the_log_with_the_least_work_goes_first_and_its_rows_are_handed_over_when_its_last_run_has_ended(
     tmp_path: Path, ran: list[str]
 ) -> None:
     logs = [
@@ -197,7 +197,7 @@ def test_a_full_disk_does_not_keep_the_lock_from_holding(tmp_path: Path) -> None
         pass
 
 
-def test_a_folder_that_cannot_be_locked_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_locked_is_reported_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_locks(*_: object) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 

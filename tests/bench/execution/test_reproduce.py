@@ -170,29 +170,27 @@ def test_other_versions_and_machines_are_named_with_both_values(result: Path) ->
     assert "the code has changed" in out
 
 
-def test_a_spec_that_is_not_the_rows_own_is_said(result: Path) -> None:
+def test_a_changed_spec_is_reported(result: Path) -> None:
     alter(result, "spec = json_set(spec, '$.scores.rpe_delta', 5.0)", "seed = 3")
     code, out, _ = call("reproduce", result, "short dive/dead-reckoning/3")
     assert code == 1
     assert "rpe_rmse_m" in out
-    assert "its identity is another" in out
+    assert "the identity differs" in out
     alter(result, "spec = json_set(spec, '$.seed', 4)", "seed = 5")
     assert "seed: 4, which was taken for 5" in call("reproduce", result, "short dive/dead-reckoning/5")[1]
 
 
-def test_another_version_of_a_package_that_brings_the_estimator_is_said(
-    result: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_version_of_the_estimators_package_is_reported(result: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (task_module, reproduce):
         monkeypatch.setattr(module, "package_of", lambda name: "navkit 2.0")
     out = call("reproduce", result, "short dive/dead-reckoning/3")[1]
-    assert "the version of navkit, now navkit 2.0, cannot be what it was made from" in out
+    assert "the version of navkit, now navkit 2.0, must have changed" in out
 
 
-def test_options_that_the_spec_lacks_are_said(result: Path) -> None:
+def test_options_missing_from_the_spec_are_reported(result: Path) -> None:
     alter(result, "spec = json_remove(spec, '$.estimator.config.max_delay_s')", "label = 'eskf gated'")
     out = call("reproduce", result, "short dive/eskf gated/3")[1]
-    assert "does not tell estimator.config.max_delay_s; it was run with today's default" in out
+    assert "lacks estimator.config.max_delay_s; it was run with today's default" in out
 
 
 @pytest.mark.parametrize(
@@ -271,7 +269,7 @@ def test_a_recorded_log_comes_out_identical_too(recorded: Path) -> None:
     assert "not" not in out.partition("came out identical")[0].partition("eskf")[2]
 
 
-def test_a_log_described_otherwise_is_told_from_one_with_other_readings(recorded: Path, tmp_path: Path) -> None:
+def test_another_description_is_distinguished_from_other_readings(recorded: Path, tmp_path: Path) -> None:
     description = tmp_path / "dive" / "log.yaml"
     text = description.read_text()
     description.write_text(text + "\n# more said\n")
@@ -285,10 +283,10 @@ def test_a_log_described_otherwise_is_told_from_one_with_other_readings(recorded
     assert description.read_text() != text
     code, out, _ = call("reproduce", recorded)
     assert code == 1
-    assert "the readings cannot be what it was made from" in out
+    assert "the readings must have changed" in out
 
 
-def test_a_log_that_is_gone_is_said_and_nothing_is_run(recorded: Path, tmp_path: Path) -> None:
+def test_a_log_that_is_gone_is_reported_and_nothing_is_run(recorded: Path, tmp_path: Path) -> None:
     rmtree(tmp_path / "dive")
     code, out, _ = call("reproduce", recorded)
     assert code == 2
@@ -346,7 +344,7 @@ def test_every_option_of_every_estimator_survives_the_store() -> None:
         assert create(name.name, **as_stored) == name.create()
 
 
-def test_the_machine_tells_what_decides() -> None:
+def test_the_machine_has_the_facts_that_affect_rounding() -> None:
     found = machine.machine()
     assert set(machine.DECIDES) < set(found)
     assert all(found[name] for name in ("architecture", "compiled_for", "blas"))

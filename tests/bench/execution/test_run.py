@@ -34,7 +34,7 @@ class Fake:
 
     answer: Callable[[int], tuple[NavState, np.ndarray]]
     act: Callable[[int], object] = lambda k: None
-    hindsight: Callable[[], Trajectory | None] = lambda: None
+    smoothed: Callable[[], Trajectory | None] = lambda: None
     factors: frozenset[str] = FACTORS
     seen: list[Epoch] | None = None
 
@@ -57,7 +57,7 @@ class FakePass:
         return Belief(self.t_ns, *self.fake.answer(self.t_ns))
 
     def finish(self) -> Trajectory | None:
-        return self.fake.hindsight()
+        return self.fake.smoothed()
 
 
 def truthful(log: Log, off: tuple[float, float, float] = (0.0, 0.0, 0.0), sigma: float = 2.0) -> Callable:
@@ -159,8 +159,8 @@ def test_keyboard_interrupt_passes_and_the_collector_is_back_on(log: Log) -> Non
     ],
 )
 def test_a_belief_that_is_not_finite_or_sane_is_divergence(log: Log, spoil: Callable, cause: str) -> None:
-    honest, spoilt_ns = truthful(log), log.start_ns + 12 * 10**9
-    result = run_log(log, Fake(lambda t_ns: spoil(*honest(t_ns)) if t_ns >= spoilt_ns else honest(t_ns)))
+    exact, spoilt_ns = truthful(log), log.start_ns + 12 * 10**9
+    result = run_log(log, Fake(lambda t_ns: spoil(*exact(t_ns)) if t_ns >= spoilt_ns else exact(t_ns)))
     assert result.status == "diverged"
     assert cause in str(result.cause)
     assert result.failed_at_s == pytest.approx(12.0)
@@ -169,8 +169,8 @@ def test_a_belief_that_is_not_finite_or_sane_is_divergence(log: Log, spoil: Call
 
 
 def test_an_estimator_without_covariance_is_none_the_worse(log: Log) -> None:
-    honest = truthful(log)
-    result = run_log(log, Fake(lambda t_ns: (honest(t_ns)[0], np.full((15, 15), np.nan))))
+    exact = truthful(log)
+    result = run_log(log, Fake(lambda t_ns: (exact(t_ns)[0], np.full((15, 15), np.nan))))
     assert result.status == "done"
     assert result.online is not None
     assert result.online.P is None
@@ -178,11 +178,11 @@ def test_an_estimator_without_covariance_is_none_the_worse(log: Log) -> None:
 
 
 def test_a_pass_may_reuse_its_arrays(log: Log) -> None:
-    honest, P = truthful(log), np.zeros((15, 15))
-    shared = honest(log.start_ns)[0]
+    exact, P = truthful(log), np.zeros((15, 15))
+    shared = exact(log.start_ns)[0]
 
     def answer(t_ns: int) -> tuple[NavState, np.ndarray]:
-        shared.p_WB_W[:] = honest(t_ns)[0].p_WB_W
+        shared.p_WB_W[:] = exact(t_ns)[0].p_WB_W
         return shared, P
 
     result = run_log(log, Fake(answer))
@@ -233,7 +233,7 @@ def test_without_truth_it_runs_on_a_grid_and_scores_are_absent_not_zero(log: Log
     assert set(scores(blind, result.online).values()) == {None}
 
 
-def test_without_prior_one_is_made_and_told(log: Log) -> None:
+def test_without_prior_one_is_made_and_reported(log: Log) -> None:
     result = run_log(replace(log, prior=None), create("dead-reckoning"))
     assert result.status == "done"
     assert result.notes
@@ -252,16 +252,16 @@ def test_an_estimator_that_cannot_begin_or_finish_fails(log: Log) -> None:
     def stuck() -> None:
         raise Diverged("indeterminate")
 
-    result = run_log(log, Fake(truthful(log), hindsight=stuck))
+    result = run_log(log, Fake(truthful(log), smoothed=stuck))
     assert (result.status, result.cause) == ("diverged", "indeterminate")
     assert result.failed_at_s == pytest.approx(30.0)
     assert list(result.outputs) == ["online"]
 
 
-def test_hindsight_comes_beside_what_was_said_at_the_time(log: Log) -> None:
+def test_smoothed_states_come_beside_the_online_ones(log: Log) -> None:
     assert log.truth is not None
     better = replace(log.truth.select(slice(100, None, 100)), lookahead_s=7.0)
-    result = run_log(log, Fake(truthful(log, (1.0, 0.0, 0.0)), hindsight=lambda: better))
+    result = run_log(log, Fake(truthful(log, (1.0, 0.0, 0.0)), smoothed=lambda: better))
     assert [(name, t.lookahead_s) for name, t in result.outputs.items()] == [("online", 0.0), ("smoothed", 7.0)]
     assert [scores(log, t)["ate_rmse_m"] for t in result.outputs.values()] == pytest.approx([1.0, 0.0])
 
@@ -322,7 +322,7 @@ def test_a_warm_estimator_does_not_compile_in_its_first_step(log: Log) -> None:
     assert step_ns[0] < 1000 * np.median(step_ns)
 
 
-# -- honesty ----------------------------------------------------------------------------------------------------------
+# -- consistency ------------------------------------------------------------------------------------------------------
 
 
 def test_nees_of_every_block_and_coverage_are_of_the_errors_there_are(log: Log) -> None:
@@ -335,9 +335,9 @@ def test_nees_of_every_block_and_coverage_are_of_the_errors_there_are(log: Log) 
 
 
 def test_a_covariance_that_is_none_is_counted_and_spares_the_blocks_that_are(log: Log) -> None:
-    honest, broken = truthful(log, (1.0, 3.0, 5.0)), 4 * np.eye(15)
+    exact, broken = truthful(log, (1.0, 3.0, 5.0)), 4 * np.eye(15)
     broken[14, 14] = -1e-9
-    row = scores(log, run_log(log, Fake(lambda t_ns: (honest(t_ns)[0], broken))).online)
+    row = scores(log, run_log(log, Fake(lambda t_ns: (exact(t_ns)[0], broken))).online)
     assert row["n_not_positive"] == 30
     assert (row["nees_all"], row["nees_biases"]) == (None, None)
     assert row["nees_position"] == pytest.approx(35 / 4)
@@ -362,7 +362,7 @@ class Believing(Fake):
     inflate: dict[str, float] | None = None
 
 
-def test_who_knows_the_truth_has_the_sensors_noise_for_innovations(log: Log) -> None:
+def test_an_estimator_with_the_truth_has_the_sensors_noise_for_innovations(log: Log) -> None:
     """Theory by another road than any filter's: r is the reading's own error, and S its own covariance."""
     result = run_log(log, Believing(truthful(log, sigma=1e-9), inflate={"heading": 0.5}), nis=True)
     dof = innovation_dof(result)
@@ -398,8 +398,8 @@ def test_readings_that_come_late_are_counted_and_not_judged(log: Log) -> None:
 
 
 def test_a_belief_under_which_no_reading_is_possible_is_counted(log: Log) -> None:
-    honest = truthful(log)
-    result = run_log(log, Fake(lambda t_ns: (honest(t_ns)[0], -100 * np.eye(15))), nis=True)
+    exact = truthful(log)
+    result = run_log(log, Fake(lambda t_ns: (exact(t_ns)[0], -100 * np.eye(15))), nis=True)
     assert result.counts["nis_undefined"] == 150 + 300 + 15 + 150
     assert set(innovation_scores(result).values()) == {None}
 
@@ -415,11 +415,11 @@ def test_a_step_in_halves_is_timed_as_one_and_the_belief_between_is_not_charged(
         now_ns += ns
 
     monkeypatch.setattr("fathom.bench.execution.drive.perf_counter_ns", lambda: now_ns)
-    honest = truthful(log)
+    exact = truthful(log)
 
     def answer(t_ns: int) -> tuple[NavState, np.ndarray]:
         spend(1_000_000)
-        return honest(t_ns)
+        return exact(t_ns)
 
     seen: list[Epoch] = []
     halves: list[Epoch] = []
@@ -440,7 +440,7 @@ def test_a_step_in_halves_is_timed_as_one_and_the_belief_between_is_not_charged(
     [("eskf", {}), ("eskf", DELAYED), ("iekf", {}), ("rts", {}), ("rts", DELAYED), ("fls", {})],
     ids=lambda value: value if isinstance(value, str) else "delayed" if value else "in-time",
 )
-def test_being_judged_changes_nothing_of_what_is_said(name: str, readings: dict[str, object]) -> None:
+def test_collecting_nis_changes_no_estimate(name: str, readings: dict[str, object]) -> None:
     log = simulate(Scenario(duration_s=40.0, **readings), seed=4)
     plain, judged = run_log(log, create(name)), run_log(log, create(name), nis=True)
     assert judged.status == "done"

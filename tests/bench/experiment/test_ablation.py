@@ -219,7 +219,7 @@ def test_a_log_is_compared_with_its_baseline_estimator_by_estimator() -> None:
     ]
 
 
-def test_a_log_may_name_who_runs_on_it_and_who_does_not_is_not_compared() -> None:
+def test_a_log_may_name_its_estimators_and_only_those_are_compared() -> None:
     plan = experiment(
         logs=[{"name": "all", "scenario": SHORT}, {"name": "some", "scenario": SHORT, "estimators": ["eskf no *"]}],
         estimators=[{"name": "eskf", "drop": ["gps", "dvl"]}],
@@ -356,8 +356,8 @@ def test_what_the_test_does_not_tell_from_chance_is_in_brackets(differences: lis
 
 
 def test_the_figure_is_vectors_and_a_legible_png(differences: list[dict[str, Any]], tmp_path: Path) -> None:
-    hindsight = [row | {"output": "smoothed", "lookahead_s": 3.0} for row in differences[:4]]
-    figure = draw_ablation(differences[:4] + hindsight, looks_of(["eskf"]), "l")
+    smoothed_rows = [row | {"output": "smoothed", "lookahead_s": 3.0} for row in differences[:4]]
+    figure = draw_ablation(differences[:4] + smoothed_rows, looks_of(["eskf"]), "l")
     pdf, png = save(figure, tmp_path / "a")
     assert pdf.read_bytes().startswith(b"%PDF")
     assert b"/Subtype /Image" not in pdf.read_bytes()

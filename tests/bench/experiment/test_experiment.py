@@ -64,7 +64,7 @@ class Pass:
 
 @pytest.fixture
 def mishap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Install somebody's package with an estimator `mishap`, here and in the workers."""
+    """Install another package with an estimator `mishap`, here and in the workers."""
     site = tmp_path / "site"
     (site / "mishaps-1.0.dist-info").mkdir(parents=True)
     (site / "mishaps.py").write_text(PLUGIN)

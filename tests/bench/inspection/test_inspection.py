@@ -150,7 +150,7 @@ def test_what_coarse_steps_bring_about_is_no_mark_and_no_row_without_reading(fau
 
 
 @pytest.mark.parametrize("words", ["repeat_probability", "outlier_probability"])
-def test_gyro_and_accelerometer_are_told_apart(words: str) -> None:
+def test_gyro_and_accelerometer_are_distinguished(words: str) -> None:
     findings = wrong(simulated(imu={"faults": {words: 0.02}}))
     assert [finding.stream for finding in findings] == ["imu", "imu"]
     assert " gyro readings" in findings[0].message
@@ -161,7 +161,7 @@ def test_gyro_and_accelerometer_are_told_apart(words: str) -> None:
     ("keys", "words"),
     [({"delay_s": 0.5}, "0.5 s after they were true"), ({"delay_s": 0.05, "disorder_s": 0.5}, "were overtaken")],
 )
-def test_late_and_disordered_readings_are_told(keys: dict[str, Any], words: str) -> None:
+def test_late_and_disordered_readings_are_reported(keys: dict[str, Any], words: str) -> None:
     findings = wrong(simulated(dvl=keys))
     assert len(findings) == 1
     assert words in said(findings, "dvl", "after they were true").message
@@ -175,12 +175,12 @@ def test_overtaken_readings_are_counted_as_they_are() -> None:
     assert f"and {overtaken} of {len(came)} were overtaken" in said(wrong(log), "dvl", "overtaken").message
 
 
-def test_a_slow_imu_is_told() -> None:
+def test_a_slow_imu_is_reported() -> None:
     assert len(wrong(simulated(imu={"rate_hz": 10.0}))) == 1
     said(wrong(simulated(imu={"rate_hz": 10.0})), "imu", "The IMU samples at 10 Hz")
 
 
-def test_stamps_of_reception_are_told_by_their_bunches() -> None:
+def test_stamps_of_reception_are_found_by_their_bunches() -> None:
     log, rng = simulated(), np.random.default_rng(1)
     read_ns = log.imu.t_ns + np.rint(rng.exponential(1e6, len(log.imu.t_ns))).astype(np.int64)
     polled_ns = -(-read_ns // 40_000_000) * 40_000_000  # a host that looks every 40 ms, and reads them one by one
@@ -191,7 +191,7 @@ def test_stamps_of_reception_are_told_by_their_bunches() -> None:
 
 
 @pytest.mark.parametrize("scattered", [0.25, 0.4])
-def test_a_jittering_imu_is_told(scattered: float) -> None:
+def test_a_jittering_imu_is_reported(scattered: float) -> None:
     log, rng = simulated(), np.random.default_rng(2)
     off_ns = np.rint(rng.uniform(-0.45, 0.45, len(log.imu.t_ns)) * scattered / 0.4 * 1e7).astype(np.int64)
     imu = dataclasses.replace(log.imu, t_ns=log.imu.t_ns + off_ns)
@@ -212,7 +212,7 @@ def dvl_of(log: Log) -> DvlStream:
     return log.dvl
 
 
-def test_zeros_and_marks_of_invalid_rows_are_told_apart_and_kept_out_of_the_outliers() -> None:
+def test_zeros_and_marks_of_invalid_rows_are_distinguished_and_kept_out_of_the_outliers() -> None:
     log = simulated()
     z = dvl_of(log).z.copy()
     z[10:200:10] = 0.0
@@ -229,14 +229,14 @@ def test_an_axis_that_is_always_zero_was_not_measured() -> None:
     assert [finding.message[:5] for finding in findings] == ["dvl y", "dvl z"]
 
 
-def test_a_sensor_that_never_changes_is_told() -> None:
+def test_a_sensor_that_never_changes_is_reported() -> None:
     log = simulated()
     assert log.gps is not None
     stuck = dataclasses.replace(log.gps, z=np.repeat(log.gps.z[:1], len(log.gps), axis=0))
     said(wrong(dataclasses.replace(log, gps=stuck)), "gps", "never changes")
 
 
-def test_fixes_that_say_themselves_that_they_are_none_are_told() -> None:
+def test_fixes_that_say_themselves_that_they_are_none_are_reported() -> None:
     log = simulated()
     assert log.gps is not None
     sigma = log.gps.sigma.copy()
@@ -244,7 +244,7 @@ def test_fixes_that_say_themselves_that_they_are_none_are_told() -> None:
     said(wrong(dataclasses.replace(log, gps=dataclasses.replace(log.gps, sigma=sigma))), "gps", "sigma over 100 m")
 
 
-def test_a_stretch_of_more_noise_is_told_with_its_time() -> None:
+def test_a_stretch_of_more_noise_is_listed_with_its_time() -> None:
     log, rng = simulated(dvl={"rate_hz": 20.0}), np.random.default_rng(3)
     z = dvl_of(log).z.copy()
     z[1000:1500] += 0.03 * rng.standard_normal((500, 3))
@@ -288,7 +288,7 @@ def test_white_noise_is_measured_from_the_values_alone() -> None:
 
 @pytest.mark.parametrize(("factor", "finds"), [(0.2, True), (1.0, False), (5.0, True)])
 @pytest.mark.parametrize("sensor", ["dvl", "depth", "heading"])
-def test_a_wrongly_stated_sigma_is_told_and_the_right_one_proposed(sensor: str, factor: float, finds: bool) -> None:
+def test_a_wrongly_stated_sigma_is_reported_and_the_right_one_proposed(sensor: str, factor: float, finds: bool) -> None:
     log = simulated()
     stream: ReadingStream = log.streams[sensor]
     stated = dataclasses.replace(log, **{sensor: dataclasses.replace(stream, sigma=stream.sigma * factor)})
@@ -305,7 +305,7 @@ def test_a_wrongly_stated_sigma_is_told_and_the_right_one_proposed(sensor: str, 
 
 
 @pytest.mark.parametrize(("factor", "words"), [(0.2, "From sample to sample"), (50.0, "Even with all motion in it")])
-def test_a_wrongly_stated_imu_density_is_told_under_way(factor: float, words: str) -> None:
+def test_a_wrongly_stated_imu_density_is_reported_under_way(factor: float, words: str) -> None:
     log = simulated(imu="consumer")
     noise = log.rig.imu_noise
     off = dataclasses.replace(noise, gyro_density=noise.gyro_density * factor)
@@ -362,14 +362,14 @@ def test_a_steady_turn_or_way_through_the_water_is_no_rest() -> None:
     assert 68.0 < log.imu.t_ns[before.last] * 1e-9 <= 70.0
 
 
-def test_the_gyro_bias_at_rest_is_told_where_it_is_beyond_what_is_stated() -> None:
+def test_the_gyro_bias_at_rest_is_reported_where_it_is_beyond_what_is_stated() -> None:
     assert wrong(at_rest((1e-3, -2e-3, 0.5e-3))) == []
     finding = said(wrong(at_rest((1e-3, -8e-3, 0.5e-3))), "imu", "At rest the gyro reads (0.001")
     assert finding.fix.startswith("streams.imu.noise.gyro_bias_sigma: 0.008")
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0])
-def test_a_wrongly_stated_density_is_told_at_rest_and_the_right_one_proposed(factor: float) -> None:
+def test_a_wrongly_stated_density_is_reported_at_rest_and_the_right_one_proposed(factor: float) -> None:
     stated = dataclasses.replace(NOISE, accel_density=NOISE.accel_density * factor)
     finding = said(wrong(at_rest(stated=stated)), "imu", "At rest the accel's white noise")
     path, value = finding.fix.split(": ")
@@ -513,7 +513,7 @@ def test_levelling_is_the_least_turn_that_makes_up_point_up(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_f_tilts_as_the_gyro_says_whatever_the_mounting(seed: int) -> None:
+def test_f_tilts_with_the_gyro_at_any_mounting(seed: int) -> None:
     """A body that rocks on the spot: f is gravity in its axes, found here through rotation matrices."""
     rng, t_s = np.random.default_rng(seed), np.arange(0, 60, 0.01)
     angles = np.stack([0.1 * np.sin(0.9 * t_s), 0.2 * np.sin(0.5 * t_s + 1), 0.4 * t_s], axis=1)
@@ -528,7 +528,7 @@ def test_f_tilts_as_the_gyro_says_whatever_the_mounting(seed: int) -> None:
     assert turned.slope == pytest.approx(-1.0, abs=0.02)
 
 
-def test_a_gyro_of_the_wrong_sign_is_told() -> None:
+def test_a_gyro_of_the_wrong_sign_is_reported() -> None:
     log = simulated()
     imu = dataclasses.replace(log.imu, w_WI_I=-log.imu.w_WI_I)
     said(wrong(dataclasses.replace(log, imu=imu)), "imu", "f tilts against the gyro")
@@ -559,7 +559,7 @@ def test_what_opening_had_to_drop_is_found_and_only_that(tmp_path: Path) -> None
     assert open_to_inspect(again)[1] == ()  # its history tells of a repair, but there is nothing to repair
 
 
-# the recorded logs, described as somebody might who has not read their READMEs
+# the recorded logs, described as by a user who has not read their READMEs
 
 MTI = {
     "file": "_040825_1735_MTI.log",
@@ -632,7 +632,7 @@ def naive(description: dict[str, Any], recording: Path, folder: Path) -> list[Fi
     return wrong(log)
 
 
-def test_ictineu_without_its_corrections_shows_what_its_readme_tells(recorded_data: Path, tmp_path: Path) -> None:
+def test_ictineu_without_its_corrections_shows_the_findings_of_its_readme(recorded_data: Path, tmp_path: Path) -> None:
     findings = naive(NAIVE_ICTINEU, recorded_data / "ictineu_stpere_2004", tmp_path)
     said(findings, "imu", "The IMU samples at 10 Hz")
     assert said(findings, "imu", "points down in the body").fix.startswith("streams.imu.axes: FRD")
@@ -644,7 +644,7 @@ def test_ictineu_without_its_corrections_shows_what_its_readme_tells(recorded_da
     assert len(findings) == 6
 
 
-def test_lauv_by_its_host_clock_shows_what_its_readme_tells(recorded_data: Path, tmp_path: Path) -> None:
+def test_lauv_by_its_host_clock_shows_the_findings_of_its_readme(recorded_data: Path, tmp_path: Path) -> None:
     findings = naive(NAIVE_LAUV, recorded_data / "lauv_noptilus2_2015", tmp_path)
     assert "5.8%" in said(findings, "imu", "come in bunches").message  # 5.6 % are under 2 ms, a fifth
     said(findings, "imu", "points down in the body")
@@ -683,7 +683,7 @@ def of_stream(stream: ReadingStream, rows: Any = slice(None), z: float = 1.0, si
 
 
 def odd(what: str, log: Log) -> Log:
-    """A log that no vehicle wrote, but somebody's converter did."""
+    """A log as written by a converter, not by a vehicle."""
     imu = log.imu
     changed: dict[str, Any] = {
         "no force": {"imu": ImuStream(imu.t_ns, imu.w_WI_I, np.zeros_like(imu.f_I))},
@@ -724,7 +724,7 @@ def test_odd_logs_are_inspected_and_drawn(what: str) -> None:
     draw_inspection(inspection).canvas.draw()
 
 
-def test_noise_where_none_is_stated_is_told() -> None:
+def test_noise_where_none_is_stated_is_reported() -> None:
     log = simulated(imu="consumer")
     found = inspect_log(dataclasses.replace(log, rig=with_noise(log.rig, gyro_density=0.0))).findings
     assert "where none is stated" in said(found, "imu", "white noise").message
@@ -777,7 +777,7 @@ def test_the_command_prints_facts_findings_and_where_the_figure_is(
 
 
 @pytest.mark.slow
-def test_the_figure_goes_where_it_is_told(tmp_path: Path) -> None:
+def test_the_figure_goes_where_it_is_reported(tmp_path: Path) -> None:
     write_folder(simulated(), tmp_path / "log")
     code, out, _ = call(tmp_path / "log", "-o", tmp_path / "new" / "page.pdf")
     assert code == 0

@@ -352,7 +352,7 @@ def test_the_late_dvl_of_ictineu_does_not_show_in_its_streams(tmp_path: Path, re
 
 
 @pytest.mark.parametrize("colour", [0.0, 0.9])
-def test_a_sigma_is_as_large_as_the_scatter_whatever_the_colour_of_the_noise(colour: float) -> None:
+def test_a_sigma_equals_the_scatter_for_noise_of_any_colour(colour: float) -> None:
     rng = np.random.default_rng(5)
     n, z = 1200, []
     x = np.sin(np.arange(n) / 40)
@@ -365,7 +365,7 @@ def test_a_sigma_is_as_large_as_the_scatter_whatever_the_colour_of_the_noise(col
     assert 0.7 < np.std(z) < 1.4  # Student's t of 11 degrees of freedom: 1.11
 
 
-def test_what_the_data_do_not_fix_has_a_sigma_that_says_so() -> None:
+def test_what_the_data_do_not_fix_has_a_sigma_that_is_reported() -> None:
     rng = np.random.default_rng(2)
     t = np.linspace(0, 1, 600)
     fit = least_squares({"a": t, "b": t * (1 + 1e-9)}, t + 0.01 * rng.standard_normal(600), blocks_of(600))

@@ -33,7 +33,7 @@ def test_the_interval_is_that_of_chi_square_over_its_degrees_of_freedom(probabil
 
 
 @pytest.mark.parametrize("dof", [3, 15])
-def test_honest_numbers_raise_as_many_false_alarms_as_they_should(dof: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_consistent_numbers_raise_the_expected_share_of_false_alarms(dof: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(consistency, "FALSE_ALARM", 0.1)
     rng, tables = np.random.default_rng(dof), 4000
     averages = [anees(rng.chisquare(dof, (20, 10)), dof, TIMES) for _ in range(tables)]
@@ -85,8 +85,8 @@ def test_nees_stands_at_the_middles_of_equal_parts_of_the_log_and_is_the_same_ag
     assert json.dumps(nees_at(log, run_log(log, create("eskf")).online, 10)) == json.dumps(found)
 
 
-def test_hindsight_with_few_covariances_has_those_times_and_no_row_twice(log: Log) -> None:
-    smoothed = run_log(log, create("fls", hindsight_covariance_s=7.0)).smoothed
+def test_smoothed_states_with_few_covariances_are_scored_at_those_times_once_each(log: Log) -> None:
+    smoothed = run_log(log, create("fls", smoothed_covariance_s=7.0)).smoothed
     kept_s = (smoothed.t_ns[np.isfinite(smoothed.P[:, 0, 0])] - log.start_ns) * 1e-9
     found = nees_at(log, smoothed, 10)
     assert [t for t in found["t_s"] if t is not None] == pytest.approx(kept_s)
@@ -150,7 +150,7 @@ def voyages(name: str, **options: object) -> tuple[dict[str, consistency.Average
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["eskf", "iekf", "fls"])
-def test_who_is_told_the_right_noise_is_honest(name: str) -> None:
+def test_an_estimator_with_the_right_noise_is_consistent(name: str) -> None:
     nis, nees = voyages(name)
     assert set(nis) == {"dvl", "depth", "gps", "heading"}
     assert nis["dvl"].dof[0] == 20 * 60 * 5 * 3

@@ -194,8 +194,8 @@ def test_without_noise_the_smoothers_on_gtsam_claim_the_floor() -> None:
     """batch that of the whole log; fls, which has seen up to one keyframe less than its lag, between two lags."""
     scenario = Scenario(duration_s=40.0)
     log = twin(scenario, 2)
-    batch = run_log(log, create("batch", hindsight_covariance_s=1.0)).smoothed
-    fls = run_log(log, create("fls", lag_s=3.0, hindsight_covariance_s=1.0)).smoothed
+    batch = run_log(log, create("batch", smoothed_covariance_s=1.0)).smoothed
+    fls = run_log(log, create("fls", lag_s=3.0, smoothed_covariance_s=1.0)).smoothed
     found = floors(scenario, 2, batch.t_ns, (2.75, 3.0, math.inf))
     sigma = {ahead: np.sqrt(np.einsum("nii->ni", floor.P)) for ahead, floor in found.items()}
     of_batch, of_fls = (np.sqrt(np.einsum("nii->ni", track.P)) for track in (batch, fls))
@@ -369,7 +369,7 @@ def test_the_ratio_is_of_pooled_squares_and_its_interval_is_paired() -> None:
             rmse_over_floor(*bad)
 
 
-def test_the_interval_covers_the_true_ratio_about_as_often_as_it_says() -> None:
+def test_the_interval_covers_the_true_ratio_about_as_often_as_stated() -> None:
     """Squared errors of six degrees of freedom, 1.44 of the bound on average; and a surer interval is a wider one."""
     rng, covered, trials, level = np.random.default_rng(1), 0, 300, 0.9
     for seed in range(trials):

@@ -103,10 +103,10 @@ def test_a_floor_that_cannot_be_found_leaves_the_run_its_scores(folder: Path, mo
 
 
 @pytest.mark.parametrize("lag_s", [1.0, 2.0])
-def test_hindsight_at_a_lag_claims_what_the_floor_of_just_that_lag_allows(lag_s: float) -> None:
+def test_smoothed_covariance_at_a_lag_equals_the_floor_of_that_lag(lag_s: float) -> None:
     """Not of a keyframe less: what comes at the very edge of the window has been seen."""
     scenario = Scenario(duration_s=30.0)
-    smoothed = run_log(simulate(scenario, 1), create("fls", lag_s=lag_s, hindsight_covariance_s=1e-3)).smoothed
+    smoothed = run_log(simulate(scenario, 1), create("fls", lag_s=lag_s, smoothed_covariance_s=1e-3)).smoothed
     bound = floors(scenario, 1, smoothed.t_ns, [lag_s])[lag_s]
     late = slice(5, None)
     ratio = smoothed.P[late].diagonal(axis1=1, axis2=2)[:, 3:9] / bound.P[late].diagonal(axis1=1, axis2=2)[:, 3:9]

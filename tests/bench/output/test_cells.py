@@ -56,7 +56,7 @@ def test_a_score_without_a_column_is_called_by_its_own_name() -> None:
         ("online", None, "no output"),
     ],
 )
-def test_an_output_is_told_by_name_and_lag(output: str, lookahead_s: float | None, written: str) -> None:
+def test_an_output_is_named_by_name_and_lag(output: str, lookahead_s: float | None, written: str) -> None:
     assert cells.output_and_lag(output, lookahead_s) == written
 
 

@@ -209,14 +209,14 @@ def judged(tmp_path_factory: pytest.TempPathFactory) -> tuple[pd.DataFrame, Path
     return pd.DataFrame(found).reindex(columns=list(COLUMNS)), folder
 
 
-def test_the_consistency_table_tells_who_is_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_the_consistency_table_marks_the_overconfident(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     summary = {(row["label"], row["output"]): row for row in summarise(rows)}
-    honest, wrong = summary["eskf", "online"], summary["overconfident", "online"]
-    assert (honest["anees_times"], honest["anees_velocity_above"]) == (6, 0)
+    consistent, wrong = summary["eskf", "online"], summary["overconfident", "online"]
+    assert (consistent["anees_times"], consistent["anees_velocity_above"]) == (6, 0)
     assert wrong["anees_velocity_above"] >= 5
-    assert wrong["nis_dvl"] > 5 > 1.2 > honest["nis_dvl"] > 0.8
-    assert honest["nis_gps"] is None  # it comes late
+    assert wrong["nis_dvl"] > 5 > 1.2 > consistent["nis_dvl"] > 0.8
+    assert consistent["nis_gps"] is None  # it comes late
     assert summary["rts", "smoothed"]["nis_dvl"] is None
     text = printed(rows, tmp_path, 120)
     lines = text[text.index(": consistency") :].splitlines()
@@ -225,7 +225,7 @@ def test_the_consistency_table_tells_who_is_overconfident(judged: tuple[pd.DataF
     assert "▲" not in of["eskf"]
     assert "▼" not in of["eskf"]
     assert f"{wrong['nis_dvl']:.3g}" in of["overconfident"]
-    shares = [100 * honest[f"within_{k}sigma_position"] for k in (1, 2, 3)]
+    shares = [100 * consistent[f"within_{k}sigma_position"] for k in (1, 2, 3)]
     assert of["eskf"].rstrip().endswith(f"{shares[0]:.0f} {shares[1]:.0f} {shares[2]:.1f}")
     assert of["dead-reckoning"].count("–") == 5 + 3 + 1
     assert "gps" not in lines[2]
@@ -272,7 +272,7 @@ def test_the_figure_of_nees_has_a_line_per_output_and_the_band(judged: tuple[pd.
     blocks = ("position, 3 dof", "attitude, 3 dof", "velocity, 3 dof", "biases, 6 dof", "all, 15 dof")
     assert tuple(panel.get_title() for panel in axes[:5]) == blocks
     averages = [line for line in axes[4].lines if len(line.get_xdata()) == 6]
-    assert len(averages) == 4  # eskf, overconfident, rts online and with hindsight
+    assert len(averages) == 4  # eskf, overconfident, rts online and smoothed
     for band, probability in zip(axes[4].patches, (0.95, 1 - 0.001 / 6), strict=True):
         low, high = chi2.interval(probability, 75)
         assert [band.get_y(), band.get_y() + band.get_height()] == pytest.approx([low / 75, high / 75])
@@ -289,7 +289,7 @@ def test_the_band_of_one_run_is_that_of_one_chi_square(rows: pd.DataFrame) -> No
     assert points.get_ydata() == pytest.approx(np.array(nees["position"]) / 3)
 
 
-def test_what_became_of_late_readings_and_outliers_is_said(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
+def test_late_readings_and_outliers_are_counted(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
     rows, _ = judged
     text = printed(rows, tmp_path, 120)
     late = text[text.index("late readings and outliers") :].splitlines()
@@ -311,7 +311,7 @@ def test_a_covariance_that_is_none_is_named(judged: tuple[pd.DataFrame, Path], t
 
 # -- in print ---------------------------------------------------------------------------------------------------------
 
-LONG = "a label of somebody who_likes $to$ say it all, with every_option that there is, at length"
+LONG = "a label of someone who_likes $to$ say it all, with every_option that there is, at length"
 ODD = ("_hidden", "100 % of & odd # {names} $x_", LONG, "eskf°")
 
 
@@ -381,7 +381,7 @@ DEUTERANOPIA = ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413),
 
 
 @pytest.mark.parametrize("vision", [np.eye(3), PROTANOPIA, DEUTERANOPIA], ids=["all", "protan", "deutan"])
-def test_the_first_six_colours_are_told_apart_by_any_eye(vision: tuple[tuple[float, ...], ...]) -> None:
+def test_the_first_six_colours_are_distinguished_by_any_eye(vision: tuple[tuple[float, ...], ...]) -> None:
     """As Machado, Oliveira & Fernandes 2009 (doi:10.1109/TVCG.2009.113) have it, in CIELAB; 2.3 is just noticeable."""
     rgb = np.array([to_rgb(colour) for colour in PALETTE[:6]])
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

@@ -114,11 +114,11 @@ def test_the_best_of_each_block_is_bold_and_no_other() -> None:
             assert {label for label, cell in cells.items() if cell["bold"]} == {
                 label for label, cell in cells.items() if best is not None and cell["value"] == best
             }, column.score
-    online, hindsight = ({label: parse(cells[2])["value"] for label, cells in of.items()} for of in found.values())
-    assert min(online.values()) != min(hindsight.values())  # each block has a best of its own
+    online, smoothed = ({label: parse(cells[2])["value"] for label, cells in of.items()} for of in found.values())
+    assert min(online.values()) != min(smoothed.values())  # each block has a best of its own
 
 
-def test_what_did_not_end_every_run_is_said_and_not_ranked() -> None:
+def test_what_did_not_end_every_run_is_reported_and_not_ranked() -> None:
     rows = table()
     lost = (rows["label"] == "eskf") & (rows["seed"] == 3)
     rows.loc[lost, "status"] = "diverged"
@@ -225,7 +225,7 @@ def test_special_letters_are_escaped() -> None:
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex here: LaTeX is not installed")
-def test_pdflatex_sets_it_whatever_somebody_called_things(tmp_path: Path) -> None:
+def test_pdflatex_sets_it_for_any_names(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     every = "".join(
         [*ESCAPED, *(f"e{accent}" for accent in ACCENTS), *(chr(0x391 + k) for k in range(58)), *map(chr, range(256))]

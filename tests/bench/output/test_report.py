@@ -34,7 +34,7 @@ SHOWN = [column.score for column in ACCURACY]
 pytestmark = pytest.mark.slow  # every test reads the page of a whole experiment, most of them in a browser
 
 EXPERIMENT = """
-description: "Does hindsight pay? <b>Not bold</b> & short."
+description: "Does smoothing pay? <b>Not bold</b> & short."
 logs: [{scenario: {duration_s: 40}}]
 estimators:
   - {name: dead-reckoning}
@@ -222,7 +222,7 @@ def test_a_header_sorts_numbers_by_size_both_ways_each_lookahead_by_itself(page:
     assert len(before) == 3  # online, smoothed, and who said nothing
 
 
-def test_sorting_is_stable_knows_numbers_in_words_and_leaves_the_absent_last(
+def test_sorting_is_stable_sorts_numbers_in_words_and_leaves_the_absent_last(
     rows: pd.DataFrame, folder: Path, browser: Any, tmp_path: Path
 ) -> None:
     one = rows[(rows["label"] == "eskf") & (rows["seed"] == 1)]
@@ -401,7 +401,7 @@ def test_hundreds_of_runs_stay_usable(rows: pd.DataFrame, folder: Path, browser:
         assert re.fullmatch(r"\[[\d.,]+, [\d.,]+\]", interval)
 
 
-def test_what_a_store_lacks_is_said_and_the_rest_is_shown(
+def test_what_a_store_lacks_is_reported_and_the_rest_is_shown(
     rows: pd.DataFrame, folder: Path, browser: Any, tmp_path: Path
 ) -> None:
     done = rows[rows["label"] == "eskf"]
@@ -515,7 +515,7 @@ def test_the_interval_of_a_mean_is_the_normal_one_where_seeds_are_many() -> None
     assert interval_over_seeds([{"drift_end_percent": 1.0}] * 4, "drift_end_percent") is None
 
 
-def test_numbers_are_told_in_words() -> None:
+def test_numbers_are_reported_in_words() -> None:
     assert [ordinal(k) for k in (2, 3, 4, 11, 12, 21, 22, 113)] == [
         *("2nd", "3rd", "4th", "11th", "12th", "21st", "22nd", "113th")
     ]

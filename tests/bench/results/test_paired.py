@@ -58,7 +58,7 @@ def test_seeds_that_all_agree_have_the_least_p_there_is() -> None:
 
 
 @pytest.mark.parametrize("n", [8, 20])
-def test_where_there_is_nothing_the_test_says_so_as_often_as_it_claims(n: int) -> None:
+def test_where_there_is_nothing_the_test_is_reported_as_often_as_its_level(n: int) -> None:
     rng = np.random.default_rng(n)
     rejected = sum(signed_rank_p(np.subtract(*scores(rng, n))) <= 0.05 for _ in range(600))
     sums = np.bincount([0])  # how many of the 2^n swaps have each sum of positive ranks, rank by rank
@@ -261,7 +261,7 @@ def test_a_seed_that_either_did_not_end_is_left_out_and_counted() -> None:
     assert record["mean_difference"] == pytest.approx(1.0)
 
 
-def test_an_output_is_compared_with_its_like_or_with_what_was_said_at_once() -> None:
+def test_an_output_is_compared_with_its_like_or_with_the_online_output() -> None:
     rows = []
     for s in range(6):
         for label, outputs in (
@@ -288,7 +288,7 @@ def test_an_output_is_compared_with_its_like_or_with_what_was_said_at_once() -> 
     ]
 
 
-def test_logs_are_paired_by_seed_whatever_the_order_of_rows() -> None:
+def test_logs_are_paired_by_seed_in_any_order_of_rows() -> None:
     rows = [run("calm", "e", s, s + 1.0) for s in range(7)] + [
         run("rough", "e", s, s + 3.0) for s in reversed(range(7))
     ]

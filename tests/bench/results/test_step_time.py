@@ -59,7 +59,7 @@ def test_a_step_on_an_edge_or_beyond_all_is_counted_once() -> None:
     assert counts == {"0": 2, "40": 1, "80": 1, str(len(EDGES_NS) - 2): 2}
 
 
-def test_runs_on_other_machines_are_left_out_and_said_to_be() -> None:
+def test_runs_on_other_machines_are_left_out_and_reported() -> None:
     rows = [row(times(seed), seed=seed) for seed in range(3)] + [row(times(9) * 100, machine=THERE)]
     found, machine = step_times(rows)
     assert machine == HERE

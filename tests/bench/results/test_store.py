@@ -126,7 +126,7 @@ def test_provenance_names_commit_versions_and_machine() -> None:
     assert set(provenance()) <= set(COLUMNS)
 
 
-def test_what_is_no_store_is_said_plainly(tmp_path: Path) -> None:
+def test_what_is_no_store_is_reported_plainly(tmp_path: Path) -> None:
     file = tmp_path / "runs.sqlite"
     for content in (b"", b"no database, but long enough to be read as one " * 9):
         file.write_bytes(content)

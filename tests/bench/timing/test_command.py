@@ -60,7 +60,7 @@ def test_a_row_is_printed_before_the_next_is_measured(
     assert "holds" in seen[0].splitlines()[-1]
 
 
-def test_a_budget_with_a_unit_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_budget_with_a_unit_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert budgets.print_budgets((Budget("an hour", 3600.0, False, lambda: Measured((60.0,)), unit="s"),), None, None)
     assert "≤ 3600 s" in (out := capsys.readouterr().out)
     assert "60 s" in out

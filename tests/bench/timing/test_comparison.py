@@ -52,7 +52,7 @@ def test_on_a_busy_machine_no_change_gives_no_alarm_and_20_percent_is_caught(eff
     assert np.mean([alarm(rng, effort, 1.2) for _ in range(30)]) > 0.75
 
 
-def test_the_interval_holds_what_is_true_about_as_often_as_it_claims() -> None:
+def test_the_interval_holds_what_is_true_about_as_often_as_its_level() -> None:
     """Few pairs make a bootstrap bold; 10 pairs at 95 % are right in nine of ten cases or more."""
     rng, inside = np.random.default_rng(2), 0
     for k in range(100):

@@ -82,7 +82,7 @@ def test_the_table_has_a_line_for_each_estimator_and_names_the_machine(rows: pd.
 def test_the_figure_holds_every_output_with_its_seeds_interval(rows: pd.DataFrame) -> None:
     (axes,) = draw_accuracy_cost(rows).axes
     drawn = [container for container in axes.containers if container.get_label() != "no"]
-    assert len(drawn) == 5  # eskf, window and rts at once; window and rts with hindsight
+    assert len(drawn) == 5  # online: eskf, window, rts; smoothed: window, rts
     ate = rows[(rows["label"] == "eskf")]["ate_rmse_m"]
     (segment,) = drawn[0].lines[2][0].get_segments()  # type: ignore[index]
     assert ate.min() - 1e-9 <= segment[0][1] < segment[1][1] <= ate.max() + 1e-9
@@ -134,7 +134,7 @@ def test_what_cannot_be_profiled_or_written_is_refused_in_one_line(
     assert result.stderr.count("\n") == 1
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not tell peaks of memory")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the system does not report peak memory")
 def test_a_run_does_not_hide_in_the_memory_that_the_run_before_left() -> None:
     plan = Experiment.from_dict(
         {"name": "m", "logs": [{"scenario": {"duration_s": 60}}], "estimators": [{"name": "isam2"}], "seeds": [1]}

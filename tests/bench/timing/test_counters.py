@@ -14,7 +14,7 @@ DECIDES = ("numpy", "numba", "gtsam")
 
 
 @pytest.mark.parametrize("name", COUNTED)
-def test_no_step_does_more_or_less_than_the_baseline_says(name: str) -> None:
+def test_no_step_does_more_or_less_than_the_baseline(name: str) -> None:
     """Where that is meant: `fathom timing counters -o tests/bench/timing/counters.json`, and the commit says why."""
     baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
     here, there = versions(), baseline["versions"]

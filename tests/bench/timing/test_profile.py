@@ -126,7 +126,7 @@ def test_of_each_step_the_quickest_is_taken_with_its_own_parts() -> None:
     assert best.finish_ns == 90
 
 
-def test_a_run_in_a_process_of_its_own_says_what_it_says_here_and_which_steps_it_took(log: Log) -> None:
+def test_a_run_in_a_process_of_its_own_gives_the_same_result_as_here_and_which_steps_it_took(log: Log) -> None:
     from fathom.bench import run_log
 
     here = run_log(log, create("eskf"))
@@ -140,10 +140,10 @@ def test_a_run_in_a_process_of_its_own_says_what_it_says_here_and_which_steps_it
         np.testing.assert_array_equal(there.online.p_WB_W, here.online.p_WB_W)
         with pytest.raises(EstimatorError, match="diverged"):
             process.run(log, create("fls", factorization="CHOLESKY"))
-        process.run(log, create("eskf"))  # is none the worse
+        process.run(log, create("eskf"))  # still works
 
 
-def test_growth_is_told_from_flatness() -> None:
+def test_growth_is_distinguished_from_flatness() -> None:
     rng = np.random.default_rng(3)
     t_s = np.arange(0.01, 1200.0, 0.01)
     noise = rng.gamma(2.0, 5_000.0, len(t_s))
@@ -188,7 +188,7 @@ def test_the_parts_of_every_estimator_add_up_to_its_steps_and_beliefs(profiles: 
 
 
 @pytest.mark.slow
-def test_timing_the_stages_changes_nothing_that_is_said(profiles: list[Profile], log: Log) -> None:
+def test_timing_the_stages_changes_no_estimate(profiles: list[Profile], log: Log) -> None:
     with stopwatch() as process:
         for one in profiles:
             online = process.run(log, create(one.label)).online

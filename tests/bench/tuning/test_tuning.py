@@ -16,9 +16,9 @@ import yaml
 from fathom.bench.cli.app import app
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution.task import Finished
-from fathom.bench.experiment.plan import Experiment, Sides
+from fathom.bench.experiment.plan import Experiment, SplitPatterns
 from fathom.bench.tuning import search as tuning_search
-from fathom.bench.tuning.objective import DUE, SCORES, Marks, Objective
+from fathom.bench.tuning.objective import EXPECTED, SCORES, Marks, Objective
 from fathom.bench.tuning.outcome import Outcome, judge, write_outcome
 from fathom.bench.tuning.search import Trial, searching
 from fathom.bench.tuning.tuning import Tuning, prepare
@@ -62,10 +62,10 @@ def test_without_a_word_the_first_half_of_the_seeds_trains_and_recorded_logs_tak
     assert split.aside == ["a"]
 
 
-def test_the_experiment_may_say_who_trains_and_the_command_line_overrules_it(tmp_path: Path) -> None:
+def test_the_experiment_may_name_the_training_runs_and_the_command_line_overrules_it(tmp_path: Path) -> None:
     plan = experiment(seeds=4, tune={"held_out": ["sim/4"]})
     assert [run.seed for run in prepare(plan, out=tmp_path).split.train] == [1, 2, 3]
-    split = prepare(plan, sides=Sides(train=("sim/[23]",)), out=tmp_path).split
+    split = prepare(plan, sides=SplitPatterns(train=("sim/[23]",)), out=tmp_path).split
     assert [run.seed for run in split.train] == [2, 3]
     assert [run.seed for run in split.held_out] == [1, 4]
 
@@ -73,20 +73,20 @@ def test_the_experiment_may_say_who_trains_and_the_command_line_overrules_it(tmp
 @pytest.mark.parametrize(
     ("changes", "sides", "complaint"),
     [
-        ({"seeds": 1}, Sides(), "nothing is held out of sim/1; name them"),
-        ({}, Sides(("sim/1",), ("sim/*",)), "sim/1 trains and sim/1 is held out: the same random numbers"),
-        ({}, Sides(("sim",), ()), "nothing is held out"),
-        ({}, Sides(("smi",), ()), "train: 'smi' matches none of: sim/1, "),
+        ({"seeds": 1}, SplitPatterns(), "nothing is held out of sim/1; name them"),
+        ({}, SplitPatterns(("sim/1",), ("sim/*",)), "sim/1 trains and sim/1 is held out: the same random numbers"),
+        ({}, SplitPatterns(("sim",), ()), "nothing is held out"),
+        ({}, SplitPatterns(("smi",), ()), "train: 'smi' matches none of: sim/1, "),
         (
             {"logs": [SHORT, {"scenario": {"mission": "box"}, "name": "box"}]},
-            Sides(("sim",), ("box",)),
+            SplitPatterns(("sim",), ("box",)),
             "sim/1 trains and box/1 is held out: the same random numbers",
         ),
-        ({"tune": {"held_uot": ["x"]}}, Sides(), "unknown key `tune.held_uot`; did you mean 'held_out'"),
+        ({"tune": {"held_uot": ["x"]}}, SplitPatterns(), "unknown key `tune.held_uot`; did you mean 'held_out'"),
     ],
 )
 def test_no_log_is_on_both_sides_and_none_is_empty(
-    tmp_path: Path, changes: dict[str, Any], sides: Sides, complaint: str
+    tmp_path: Path, changes: dict[str, Any], sides: SplitPatterns, complaint: str
 ) -> None:
     with pytest.raises(ExperimentError, match=re.escape(complaint).replace("'held_uot';", "'held_uot'.*")):
         prepare(experiment(**changes), sides=sides, out=tmp_path)
@@ -97,7 +97,7 @@ def test_one_recording_under_two_names_is_not_held_out(tmp_path: Path) -> None:
     logs = [same | {"name": "x"}, {"log": str(tmp_path / "." / "b" / ".." / "a"), "name": "y"}]
     (tmp_path / "b").mkdir()
     with pytest.raises(ExperimentError, match="x trains and y is held out: the same recording"):
-        prepare(experiment(logs=logs), sides=Sides(("x",), ("y",)), out=tmp_path)
+        prepare(experiment(logs=logs), sides=SplitPatterns(("x",), ("y",)), out=tmp_path)
 
 
 def test_what_cannot_be_tuned_is_refused_before_anything_runs(tmp_path: Path) -> None:
@@ -114,14 +114,14 @@ def test_what_cannot_be_tuned_is_refused_before_anything_runs(tmp_path: Path) ->
         Objective("ate_rmse")
     blind = simulate(Scenario(duration_s=20), seed=1)
     write_folder(replace(blind, truth=None), tmp_path / "blind", "csv")
-    logs, sides = [*recorded(tmp_path, "a"), {"log": str(tmp_path / "blind")}], Sides(("blind",), ("a",))
+    logs, sides = [*recorded(tmp_path, "a"), {"log": str(tmp_path / "blind")}], SplitPatterns(("blind",), ("a",))
     with pytest.raises(ExperimentError, match="blind: no truth, so no ate_rmse_m; --score nis_dvl"):
         prepare(experiment(logs=logs), sides=sides, out=tmp_path)
     assert prepare(experiment(logs=logs), sides=sides, objective=Objective("nis_dvl"), out=tmp_path).dials
     with pytest.raises(DatasetError, match="ictineu_stpere_2004: held out, but neither here nor in"):
         prepare(
             experiment(logs=[*recorded(tmp_path, "c"), {"log": "ictineu_stpere_2004"}]),
-            sides=Sides(("c",), ()),
+            sides=SplitPatterns(("c",), ()),
             out=tmp_path,
             data=tmp_path,
         )
@@ -142,8 +142,8 @@ def test_the_dials_are_what_the_estimator_uses_and_the_training_logs_have(tmp_pa
 # -- what is made smaller ---------------------------------------------------------------------------------------------
 
 
-def test_the_loss_of_an_honest_score_is_least_at_what_is_due_and_alike_on_either_side() -> None:
-    for score, due in DUE.items():
+def test_the_loss_of_a_consistency_score_is_least_at_its_expected_value_and_symmetric() -> None:
+    for score, due in EXPECTED.items():
         objective, n = Objective(score), np.ones(2)
         assert objective.loss(np.array([due, due]), n) == pytest.approx(0, abs=1e-12)
         assert objective.loss(np.array([2 * due] * 2), n) == pytest.approx(objective.loss(np.array([due / 2] * 2), n))
@@ -192,7 +192,7 @@ class Sea:
 
 
 def valley(factors: dict[str, float], log: str, seed: int | None) -> float:
-    """Least at dvl 3, whatever gps."""
+    """Least at dvl 3, for any gps."""
     return math.exp(abs(math.log(factors["dvl"] / 3)))
 
 
@@ -265,7 +265,7 @@ def test_the_same_seed_gives_the_same_search_and_another_seed_another(tmp_path, 
     assert [trial.factors for trial in first[1:]] != [trial.factors for trial in third[1:]]
 
 
-def test_another_range_estimator_or_log_begins_a_new_study_and_says_so(tmp_path, monkeypatch) -> None:
+def test_another_range_estimator_or_log_begins_a_new_study_and_is_reported(tmp_path, monkeypatch) -> None:
     one = prepare(experiment(), out=tmp_path)
     go(one, monkeypatch, Sea(valley), 5)
     with searching(one) as search:
@@ -295,14 +295,14 @@ def test_a_trial_that_diverges_is_a_bad_one_and_no_crash(tuning, monkeypatch) ->
     assert np.mean(np.array(later) > 1) > 0.7  # the search learns to stay away
 
 
-def test_where_every_trial_goes_wrong_the_search_ends_and_says_why(tuning, monkeypatch) -> None:
+def test_where_every_trial_fails_the_search_ends_and_says_why(tuning, monkeypatch) -> None:
     sea = Sea(lambda *_: None)
-    with pytest.raises(ExperimentError, match="eskf: no trial came to its end; sim/1: diverged: lost"):
+    with pytest.raises(ExperimentError, match="eskf: no trial finished; sim/1: diverged: lost"):
         go(tuning, monkeypatch, sea)
     assert len(sea.asked) <= 10 * 6
 
 
-# -- whether it is borne out ------------------------------------------------------------------------------------------
+# -- whether it is confirmed -------------------------------------------------------------------------------------------
 
 
 def test_a_gain_that_what_is_held_out_bears_out_is_not_warned_of(tuning, monkeypatch) -> None:
@@ -326,10 +326,10 @@ def test_a_gain_on_training_alone_is_warned_of(tuning, monkeypatch) -> None:
 
     outcome = end(tuning, monkeypatch, own)
     assert outcome.best.number != 0
-    assert any("is not borne out by what was held out" in warning for warning in outcome.warnings)
+    assert any("is not confirmed on held-out runs" in warning for warning in outcome.warnings)
 
 
-def test_a_smaller_gain_on_what_is_held_out_is_told_apart_from_none(tuning, monkeypatch) -> None:
+def test_a_smaller_gain_on_what_is_held_out_is_distinguished_from_none(tuning, monkeypatch) -> None:
     def half(factors: dict[str, float], log: str, seed: int | None) -> float:
         share = 1.0 if seed is not None and seed <= 6 else 0.3
         return valley(factors, log, seed) ** share
@@ -338,7 +338,7 @@ def test_a_smaller_gain_on_what_is_held_out_is_told_apart_from_none(tuning, monk
     assert warning.startswith("training and held-out part: a gain of ")
 
 
-def test_the_best_at_an_end_of_the_range_is_told(tuning, monkeypatch) -> None:
+def test_the_best_at_an_end_of_the_range_is_reported(tuning, monkeypatch) -> None:
     outcome = end(tuning, monkeypatch, lambda factors, *_: 1 / factors["dvl"], 40)
     assert any(warning.startswith("dvl: the best factor, ") for warning in outcome.warnings)
 

@@ -416,7 +416,7 @@ def test_an_unknown_name_gets_its_nearest():
         open_log("ictineu_st_pere_2004")
 
 
-def test_a_folder_without_a_description_says_so(tmp_path):
+def test_a_folder_without_a_description_is_reported(tmp_path):
     with pytest.raises(DatasetError, match=r"no log\.yaml in this folder"):
         open_log(tmp_path)
 

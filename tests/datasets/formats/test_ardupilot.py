@@ -1,4 +1,4 @@
-"""Dataflash logs: read as pymavlink's own reader reads them, in chunks of any size, and whatever they have suffered."""
+"""Dataflash logs: read as pymavlink's own reader reads them, in chunks of any size, damaged or not."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_letters_that_a_simulation_has_no_use_for_are_read_as_pymavlink_reads_th
     }  # fmt: skip
 
 
-def test_what_a_log_holds_is_told_by_name_and_instance(voyage, written):
+def test_what_a_log_holds_is_named_by_name_and_instance(voyage, written):
     held = {(h.message, h.sender): h for h in ArduPilotRecording(format="ardupilot", file=FILE).contents(written)}
     assert list(held) == sorted(held, key=lambda key: (key[0], key[1] or 0))
     assert held["IMU", 1].count == len(voyage.imu.t_ns)
@@ -145,7 +145,7 @@ def test_chunks_of_any_size_give_the_same_messages(tmp_path, monkeypatch, chunk_
     assert times(tmp_path, data) == whole
 
 
-def test_bytes_between_messages_are_passed_over_and_told(tmp_path):
+def test_bytes_between_messages_are_passed_over_and_reported(tmp_path):
     data = head() + imu(1) + imu(2) + b"junk\xa3\x95\x00\xa3" + imu(3) + imu(4)
     values, notes = times(tmp_path, data)
     assert values == [1, 3, 4]  # message 2 has no other behind it: it may have been cut
@@ -160,7 +160,7 @@ def test_a_message_that_lost_its_tail_takes_no_bytes_of_the_next(tmp_path):
 
 
 @pytest.mark.parametrize("cut", [1, 2, 3, 30])
-def test_a_truncated_tail_is_told(tmp_path, cut):
+def test_a_truncated_tail_is_reported(tmp_path, cut):
     values, notes = times(tmp_path, head() + imu(1) + imu(2) + imu(3)[:cut])
     assert values == [1, 2]
     assert notes[0] == f"ardupilot: 1 stretches, {cut} bytes, of no whole message skipped"

@@ -1,4 +1,4 @@
-"""Tables, arrays and TUM files: read piece by piece, the same whatever the pieces; memory is that of what is kept."""
+"""Tables, arrays and TUM files: read in pieces of any size, with the same result; memory is that of the kept rows."""
 
 from __future__ import annotations
 
@@ -333,7 +333,7 @@ def test_comma2k19_has_the_rates_of_its_readme(comma):
     assert comma.truth_kind == "reference"
 
 
-def test_comma2k19s_imu_is_forward_left_up_and_as_strong_as_its_readme_says(comma):
+def test_comma2k19s_imu_is_forward_left_up_and_as_strong_as_in_its_readme(comma):
     assert np.linalg.norm(comma.imu.f_I, axis=1).mean() == pytest.approx(9.728, abs=0.001)
     assert comma.imu.f_I.mean(axis=0)[2] > 9.5
     turned = np.sum(comma.imu.w_WI_I[:, 2] * np.gradient(comma.imu.t_ns * 1e-9))

@@ -143,7 +143,7 @@ def test_a_wrong_length_does_not_swallow_what_follows():
     assert values == [1.0, 3.0, 4.0]
 
 
-def test_a_truncated_tail_is_told():
+def test_a_truncated_tail_is_reported():
     data = b"".join(small_log(4))
     values, notes = depths(data[:-30])
     assert values == [1.0, 2.0, 3.0]

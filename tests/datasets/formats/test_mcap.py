@@ -189,7 +189,7 @@ def test_an_encoding_that_is_not_supported_is_named(tmp_path):
 # ------------------------------------------------------------------------------------------------- damage and errors
 
 
-def test_a_cut_file_gives_what_is_whole_and_says_so(log, tmp_path):
+def test_a_cut_file_gives_what_is_whole_and_is_reported(log, tmp_path):
     folder = write_mcap(log, tmp_path / "log", "protobuf", chunk_size=50_000)
     data = (folder / "log.mcap").read_bytes()
     (folder / "log.mcap").write_bytes(data[: len(data) // 2])

@@ -208,7 +208,7 @@ def test_an_extra_hides_no_other_error():
         raise ImportError("libfoo.so.1: cannot open shared object file")
 
 
-def test_what_is_not_held_is_told_with_what_is_and_not_with_all_of_it():
+def test_what_is_not_held_is_listed_with_what_is_and_not_with_all_of_it():
     names = [f"/topic/{i:03d}" for i in range(100)]
     told = str(not_found("x.bag", "topic", "/topic/0033", names))
     assert told.startswith("x.bag: no topic '/topic/0033'; did you mean '/topic/0")
@@ -216,7 +216,7 @@ def test_what_is_not_held_is_told_with_what_is_and_not_with_all_of_it():
     assert str(not_found("x.bag", "topic", "/imu", [])) == "x.bag: no topic '/imu'; found none"
 
 
-def test_a_recording_without_a_folder_says_so(tmp_path):
+def test_a_recording_without_a_folder_is_reported(tmp_path):
     flight = loader("imc").model_validate({"format": "imc", "file": "gone/a.lsf"})
     with pytest.raises(DatasetError, match=r"gone/a.lsf: no such file$"):
         flight.path(tmp_path)

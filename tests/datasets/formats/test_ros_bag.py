@@ -205,7 +205,7 @@ def test_a_field_may_change_its_length_but_not_end_before_the_index(tmp_path):
         read(tmp_path, "/dvl", "beams.2.distance", file="bag")
 
 
-def test_a_type_nobody_knows_names_the_option_that_helps(small, tmp_path):
+def test_an_unknown_type_names_the_option_that_helps(small, tmp_path):
     folder = write_ros2(small, tmp_path / "log")
     drop_definitions(folder)
     with pytest.raises(
@@ -227,7 +227,7 @@ def test_a_type_nobody_knows_names_the_option_that_helps(small, tmp_path):
         read(folder, "/imu", "angular_velocity.x", file="bag", distro="humbel")
 
 
-def test_a_wrong_definition_is_told_and_not_misread(small, tmp_path):
+def test_a_wrong_definition_is_reported_and_not_misread(small, tmp_path):
     folder = write_ros2(small, tmp_path / "log")
     drop_definitions(folder)
     (folder / "my.msg").write_text("MSG: fathom_msgs/Reading\nstd_msgs/Header header\nfloat64[] z\nfloat64[3] sigma\n")
@@ -243,7 +243,7 @@ def ros1(small, tmp_path_factory):
     return write_ros1(small, tmp_path_factory.mktemp("written") / "ros1")
 
 
-def test_an_unfinished_bag_gives_what_is_whole_and_says_so(log, tmp_path):
+def test_an_unfinished_bag_gives_what_is_whole_and_is_reported(log, tmp_path):
     folder = write_ros1(log, tmp_path / "log")
     data = (folder / "log.bag").read_bytes()
     (folder / "log.bag").write_bytes(data[: len(data) // 2])

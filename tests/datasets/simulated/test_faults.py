@@ -121,7 +121,7 @@ def test_imu_outliers_have_the_stated_share_and_sizes():
 
 
 @pytest.mark.parametrize("sensor", ["imu", *SENSORS])
-def test_repeated_readings_say_again_what_the_last_one_said(sensor):
+def test_repeated_readings_repeat_the_last_value(sensor):
     log = with_faults(sensor, repeat_probability=0.4)
     (t_ns, z), (all_ns, all_z) = imu_and(log, sensor), imu_and(clean(), sensor)
     assert np.array_equal(t_ns, all_ns)
@@ -325,7 +325,7 @@ EVERYTHING = {
 }
 
 
-def test_a_log_with_every_kind_of_fault_can_be_cut_and_is_told():
+def test_a_log_with_every_kind_of_fault_can_be_cut_and_is_reported():
     log = simulate(Scenario.from_dict({"duration_s": 120, **EVERYTHING}), 2)
     assert cut(log).failure is None
     assert list(log.notes[3:]) == [

@@ -1,4 +1,4 @@
-"""Bottom lock: which beams reach the seabed, and what is said of the velocity that they give."""
+"""Bottom lock: which beams reach the seabed, and the velocity and sigma that they give."""
 
 import dataclasses
 
@@ -88,7 +88,7 @@ def test_hills_decide_too():
     assert set(hilly.dvl.t_ns) - set(flat.dvl.t_ns)
 
 
-def test_a_dvl_leaning_too_far_says_nothing():
+def test_a_dvl_leaning_too_far_gives_no_reading():
     log = log_of(max_tilt_deg=15, faults=DvlFaults(misalignment_deg=(0, 10, 0)))
     t_ns, R_WB, _ = poses_at_every_ping(log)
     up_D = R_WB @ Rotation.from_euler("Y", 10, degrees=True).as_matrix()
@@ -130,7 +130,7 @@ def test_three_beams_give_the_velocity_with_sigmas_root_two_larger():
 
 
 @pytest.mark.parametrize("lost", range(4))
-def test_errors_of_three_beams_are_correlated_as_their_covariance_says(lost):
+def test_errors_of_three_beams_are_correlated_as_their_covariance_predicts(lost):
     """The DVL leans so that one beam alone is out of range."""
     A = np.delete(janus_beams(np.radians(22.5)), lost, axis=0)
     cov = np.linalg.inv(A.T @ A)

@@ -59,7 +59,7 @@ def test_waves_have_the_height_and_the_energy_period_of_their_spectrum():
     assert np.mean(sea.frequency_rad_s < 2 * np.pi / 6.0) == pytest.approx(np.exp(-1.25), abs=1 / 16)
 
 
-def test_waves_run_where_they_are_said_to():
+def test_waves_run_in_the_stated_direction():
     """Seen from a point that runs along with the longest wave, that wave stands still."""
     sea = sea_of()
     i = int(np.argmin(sea.frequency_rad_s))
@@ -210,10 +210,10 @@ def test_soft_iron_deviates_a_heading_twice_around():
     assert deviation_deg.min() < -2.5
 
 
-# -- telling, and what is refused
+# -- notes, and what is refused
 
 
-def test_the_sea_is_told():
+def test_the_sea_is_noted():
     scenario = Scenario(
         duration_s=20,
         waves=WAVES,

@@ -102,7 +102,7 @@ def test_without_noise_the_prior_is_the_state_at_the_end_of_the_window(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_says(seed):
+def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_predicts(seed):
     log, state, _ = voyage(seed, noisy=False)
     b_a = np.random.default_rng(seed).normal(size=3) * 0.05
     biased = initialise(replace(log, imu=replace(log.imu, f_I=log.imu.f_I + b_a))).belief
@@ -115,7 +115,7 @@ def test_an_accelerometer_bias_tilts_the_level_as_the_covariance_says(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_wrong_heading_turns_the_velocity_as_the_covariance_says(seed):
+def test_a_wrong_heading_turns_the_velocity_as_the_covariance_predicts(seed):
     log, state, _ = voyage(seed, noisy=False)
     assert log.heading is not None
     wrong = initialise(replace(log, heading=replace(log.heading, z=log.heading.z + 0.03))).belief
@@ -133,7 +133,7 @@ def test_its_readings_are_not_in_the_epochs_that_follow():
     assert epochs[0].imu["t_ns"][0] > belief.t_ns
 
 
-def test_what_no_sensor_tells_is_wide_and_said():
+def test_what_no_sensor_measures_has_a_large_sigma_and_a_note():
     log, _, _ = voyage(2, noisy=True)
     bare = initialise(Log("x", log.rig, log.imu))
     sigma = np.sqrt(np.diag(bare.belief.P))
@@ -178,7 +178,7 @@ def test_only_what_was_received_in_the_window_is_used():
     log, _, _ = voyage(5, noisy=False)
     assert log.dvl is not None
     far = replace(log, dvl=replace(log.dvl, received_ns=log.dvl.t_ns + 60_000_000_000))
-    assert any("no DVL heard" in note for note in initialise(far).notes)
+    assert any("no DVL readings" in note for note in initialise(far).notes)
 
 
 # -- on simulated logs, afloat ----------------------------------------------------------------------------------------
@@ -408,7 +408,7 @@ def test_what_is_of_second_order_in_a_velocity_is_as_many_draws_say():
     np.testing.assert_allclose(found, of.T @ of / len(of), atol=0.02 * np.abs(found).max())
 
 
-def test_fixes_tell_the_velocity_in_the_world_whatever_the_heading_is():
+def test_fixes_give_the_velocity_in_the_world_at_any_heading():
     log = afloat(16, dvl=None, heading=None)
     error, P, start = error_of(log)
     assert start == "moving, heading unknown"

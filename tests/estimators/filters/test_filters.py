@@ -217,7 +217,7 @@ def test_a_heading_across_the_wrap_is_no_full_turn(name: str, psi: float) -> Non
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_late_readings_are_lived_through_again(name: str) -> None:
+def test_late_readings_are_replayed(name: str) -> None:
     """Late, but all received by the end: the last belief is that of a log in which they came in time."""
     in_time = simulate(Scenario(duration_s=30.0), seed=5)
     delayed = simulate(Scenario(duration_s=30.0, **DELAYED), seed=5)

@@ -1,4 +1,4 @@
-"""Gates leave out what an honest filter would not believe, no more than they were told to, and count it once."""
+"""Gates reject outliers at the stated rate, and count each once."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def with_gps_outliers(log: Log, every: int, by_m: float) -> tuple[Log, Log, int]
     return replace(log, gps=dirty), replace(log, gps=sparse), heard
 
 
-def test_widths_are_quantiles_of_chi_square_and_open_where_nothing_is_said() -> None:
+def test_widths_are_quantiles_of_chi_square_and_infinite_without_a_gate() -> None:
     widths = gate_widths({"gps": 0.99, "heading": 0.9})
     assert widths[KIND["gps"], 2] == pytest.approx(chi2.ppf(0.99, 2))
     assert widths[KIND["attitude"], 3] == pytest.approx(chi2.ppf(0.9, 3))
@@ -36,7 +36,7 @@ def test_widths_are_quantiles_of_chi_square_and_open_where_nothing_is_said() -> 
 
 
 @pytest.mark.parametrize("name", FILTERS)
-def test_of_honest_readings_a_gate_leaves_out_its_share(name: str) -> None:
+def test_a_gate_rejects_the_stated_share_of_normal_readings(name: str) -> None:
     """Innovations of a consistent filter are white: of n readings the number left out is binomial."""
     out = n = 0
     for seed in range(2):

@@ -70,11 +70,11 @@ def test_its_last_state_is_the_filters_and_its_times_are_the_ticks() -> None:
     last, filtered = result.smoothed.state(-1), result.online.state(-1)
     assert np.abs(filtered.local(last)).max() < 1e-12
     assert np.allclose(result.smoothed.P[-1], result.online.P[-1], rtol=1e-9, atol=1e-18)
-    assert np.linalg.eigvalsh(result.online.P - result.smoothed.P).min() > -1e-6  # hindsight never knows less
+    assert np.linalg.eigvalsh(result.online.P - result.smoothed.P).min() > -1e-6  # smoothing never loses information
 
 
-def test_late_readings_leave_no_trace_in_hindsight(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Epochs that were lived again replace those that they were lived for, across pages."""
+def test_late_readings_leave_no_trace_in_the_smoothed_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Replayed epochs replace the stored ones, across pages."""
     monkeypatch.setattr(rts, "PAGE", 7)
     logs = simulate(Scenario(duration_s=30.0), seed=5), simulate(Scenario(duration_s=30.0, **DELAYED), seed=5)
     last_ns = int(logs[1].imu.t_ns[-1] - 1e9)
@@ -88,7 +88,7 @@ def test_late_readings_leave_no_trace_in_hindsight(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mission", ["lawnmower", "yo-yo"])
-def test_hindsight_beats_the_filter(mission: str) -> None:
+def test_smoothed_states_are_more_accurate_than_the_filter(mission: str) -> None:
     squares = {"online": np.zeros(2), "smoothed": np.zeros(2)}
     for seed in range(20):
         log = simulate(Scenario(mission=mission, duration_s=120.0), seed)
@@ -103,8 +103,8 @@ def test_hindsight_beats_the_filter(mission: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_over_no_time_hindsight_is_handed_on_as_it_is(seed: int) -> None:
-    """No motion and no noise: whatever is known later is known now, a radian away and to the last digit of P."""
+def test_smoothing_over_an_interval_of_zero_changes_nothing(seed: int) -> None:
+    """Without motion and noise, smoothed equals filtered, with a state a radian away and to the last digit of P."""
     rng = np.random.default_rng(seed)
     x, M = random_state(rng), rng.normal(size=(2, 15, 15))
     now = as_record(Belief(0, x, M[0] @ M[0].T))

@@ -29,7 +29,7 @@ def gaps_in_sigma(a: Trajectory, b: Trajectory) -> np.ndarray:
 
 
 def test_batch_and_incremental_lags_agree_in_state_and_in_covariance() -> None:
-    """All 15 components, online and with hindsight, from the second tick on."""
+    """All 15 components, online and smoothed, from the second tick on."""
     log = simulate(replace(TACTICAL, duration_s=30.0), seed=4)
     incremental, batch = run_log(log, create("fls", **EVERY_STEP_ANEW)), run_log(log, create("fls-batch"))
     assert batch.status == "done", batch.cause
@@ -73,7 +73,7 @@ def test_with_nothing_marginalised_batch_and_incremental_lags_are_one_also_prein
 
 @pytest.mark.parametrize("name", ["fls", "fls-batch"])
 def test_a_lag_of_nothing_is_a_filter(name: str) -> None:
-    """Online it ends where the filter ends; with hindsight it says at its keyframes what it said at the time."""
+    """Online it ends where the filter ends; smoothed, its keyframes equal its online states."""
     log = simulate(TACTICAL, seed=4)
     result, eskf = run_log(log, create(name, lag_s=0.0)), run_log(log, create("eskf"))
     assert result.status == "done", result.cause

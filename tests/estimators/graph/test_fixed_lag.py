@@ -1,4 +1,4 @@
-"""The smoother agrees with the filter, with dense least squares, and with itself whatever the keyframes."""
+"""The smoother agrees with the filter, with dense least squares, and with itself for any choice of keyframes."""
 
 from __future__ import annotations
 
@@ -59,26 +59,26 @@ def test_filter_and_smoother_agree_online(mission: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [3.0, 10.0])
-def test_hindsight_beats_the_moment(lag_s: float) -> None:
+def test_smoothed_velocity_is_more_accurate_than_online(lag_s: float) -> None:
     """Pooled over seeds: a smoother that loses to its own filter has a bug. Velocity shows it best; position drifts."""
-    online = hindsight = 0.0
+    online = smoothed = 0.0
     for seed in range(3):
         log = simulate(Scenario(duration_s=60.0, imu="tactical"), seed=seed)
         result = run_log(log, create("fls", lag_s=lag_s))
         rows = np.searchsorted(log.truth.t_ns, result.online.t_ns)
         online += np.square(result.online.v_WB_W - log.truth.v_WB_W[rows]).sum()
-        hindsight += np.square(result.smoothed.v_WB_W - log.truth.v_WB_W[rows]).sum()
+        smoothed += np.square(result.smoothed.v_WB_W - log.truth.v_WB_W[rows]).sum()
         assert np.array_equal(result.smoothed.t_ns, result.online.t_ns)
         assert result.smoothed.lookahead_s == lag_s
-    assert hindsight < 0.8 * online
+    assert smoothed < 0.8 * online
 
 
-def test_hindsight_covariance_is_smaller_than_the_moments() -> None:
+def test_smoothed_covariance_is_smaller_than_online() -> None:
     result = run_log(simulate(Scenario(duration_s=60.0, imu="tactical"), seed=1), create("fls", lag_s=5.0))
     kept = np.isfinite(result.smoothed.P[:, 0, 0])
     assert 5 <= kept.sum() < len(kept)
-    online, hindsight = (np.einsum("nii->ni", t.P[kept]) for t in (result.online, result.smoothed))
-    assert (hindsight[:-1] <= online[:-1] * (1 + 1e-6)).all()
+    online, smoothed = (np.einsum("nii->ni", t.P[kept]) for t in (result.online, result.smoothed))
+    assert (smoothed[:-1] <= online[:-1] * (1 + 1e-6)).all()
 
 
 def test_one_second_keyframes_lose_nothing() -> None:
@@ -170,7 +170,7 @@ def test_late_readings_inside_the_window_are_used_and_older_ones_counted() -> No
 
 
 @pytest.mark.slow
-def test_a_late_reading_is_worth_the_same_in_hindsight() -> None:
+def test_a_late_reading_leads_to_the_same_smoothed_states() -> None:
     scenario = replace(TACTICAL, duration_s=60.0)
     in_time, late = simulate(scenario, seed=3), simulate(_late(scenario, 1.0), seed=3)
     heard = until(in_time, int(late.imu.t_ns[-1]) - 10**9, "gps", "heading")
@@ -195,7 +195,7 @@ def test_a_silent_dvl_leaves_keyframes_to_the_others() -> None:
     assert 36 <= result.counts["keyframes"] <= 43
 
 
-def test_what_no_sensor_tells_of_stays_unknown_when_a_keyframe_has_turned() -> None:
+def test_what_no_sensor_measures_stays_unknown_when_a_keyframe_has_turned() -> None:
     """Late DVL readings turn the first keyframes by a degree after depth has fixed their height to a centimetre.
 
     Seen in axes off by as much, the metre that nobody knows of east and north would look like one of height.
@@ -412,8 +412,8 @@ def test_dvl_readings_out_of_order_are_summed_in_order() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "honest"), [("straight", True), ("held", False)])
-def test_preintegration_straight_is_honest_and_held_is_known_not_to_be(mode: str, honest: bool) -> None:
+@pytest.mark.parametrize(("mode", "consistent"), [("straight", True), ("held", False)])
+def test_preintegration_is_consistent_when_straight_and_overconfident_when_held(mode: str, consistent: bool) -> None:
     """Velocity NEES over 20 seeds: holding loses what the vehicle does between readings, and nobody counts that."""
     total, n = 0.0, 20
     for seed in range(n):
@@ -421,7 +421,7 @@ def test_preintegration_straight_is_honest_and_held_is_known_not_to_be(mode: str
         result = run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between=mode))
         total += float(nees(error_states(log.truth, result.online), result.online.P, BLOCKS["velocity"])[49])
     low, high = chi2.interval(0.999, 3 * n)
-    assert (low < total < high) == honest, total / n
+    assert (low < total < high) == consistent, total / n
 
 
 @pytest.mark.slow

@@ -27,18 +27,18 @@ def test_online_every_smoother_is_the_filter_and_least_squares_so_far(name: str,
 @pytest.mark.parametrize("thorough", [False, True], ids=["as shipped", "to the last digit"])
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", ["batch", "isam2"])
-def test_with_all_hindsight_every_smoother_is_least_squares(name: str, seed: int, thorough: bool) -> None:
-    online, hindsight = run(name, seed, thorough)
-    assert apart(hindsight, exact(seed, len(online))) < 1e-6
-    assert apart(hindsight, run("rts", seed)[1]) < 1e-6
-    assert apart(hindsight, online) > 0.1  # there was something to learn
+def test_over_the_whole_log_every_smoother_is_least_squares(name: str, seed: int, thorough: bool) -> None:
+    online, smoothed = run(name, seed, thorough)
+    assert apart(smoothed, exact(seed, len(online))) < 1e-6
+    assert apart(smoothed, run("rts", seed)[1]) < 1e-6
+    assert apart(smoothed, online) > 0.1  # there was something to learn
 
 
 @pytest.mark.parametrize("thorough", [False, True], ids=["as shipped", "to the last digit"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_at_a_lag_hindsight_is_least_squares_on_what_had_been_seen_by_then(seed: int, thorough: bool) -> None:
+def test_at_a_lag_smoothed_states_are_least_squares_on_the_readings_so_far(seed: int, thorough: bool) -> None:
     """A state leaves once the keyframe has come that is the lag younger; marginalising the older lost nothing."""
-    _, hindsight = run("fls", seed, thorough)
-    n = len(hindsight)
-    assert apart(hindsight, [exact(seed, min(k + LAG + 1, n))[k] for k in range(n)]) < 1e-6
-    assert apart(hindsight[: -2 * LAG], exact(seed, n)[: -2 * LAG]) > 1e-3  # the window does matter
+    _, smoothed = run("fls", seed, thorough)
+    n = len(smoothed)
+    assert apart(smoothed, [exact(seed, min(k + LAG + 1, n))[k] for k in range(n)]) < 1e-6
+    assert apart(smoothed[: -2 * LAG], exact(seed, n)[: -2 * LAG]) > 1e-3  # the window does matter

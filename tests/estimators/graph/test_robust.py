@@ -53,7 +53,7 @@ def test_a_loss_costs_five_percent_where_noise_is_normal(loss: Loss) -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 3])
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
-def test_a_normal_residual_is_beyond_its_width_as_often_whatever_its_rows(loss: Loss, n: int) -> None:
+def test_a_normal_residual_is_beyond_its_width_as_often_for_any_number_of_rows(loss: Loss, n: int) -> None:
     draws = 200_000
     beyond = np.linalg.norm(np.random.default_rng(n).normal(size=(draws, n)), axis=1) > width(loss, n)
     low, high = binom.interval(0.999, draws, 2 * norm.sf(WIDTHS[loss]))
@@ -114,7 +114,7 @@ def _plain() -> tuple[Log, Driven]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("loss", LOSSES)
-def test_with_honest_noise_a_loss_changes_little_and_counts_what_theory_says(loss: Loss) -> None:
+def test_with_normal_noise_a_loss_changes_little_and_counts_the_share_of_theory(loss: Loss) -> None:
     """The plain estimate is efficient, so the robust one's variance is the plain one's plus that of their difference
     (Hausman 1978): 1/0.95 − 1 of a variance. Positions are three numbers over such a log, their course is smooth. An
     estimate leans towards each reading, which hides at most a tenth of a residual's variance here.

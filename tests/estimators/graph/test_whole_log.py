@@ -1,4 +1,4 @@
-"""With all the hindsight there is, two roads lead to one estimate: factor graphs, and a filter run backwards."""
+"""Over the whole log, factor graphs and a filter run backwards give one estimate."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_each_option_of_exactness_brings_isam2_nearer_to_the_optimum() -> None:
 
 
 @pytest.mark.slow
-def test_hindsight_over_the_whole_log_beats_a_lag_which_beats_none() -> None:
+def test_the_whole_log_is_more_accurate_than_a_lag_which_beats_no_lag() -> None:
     """Velocity, pooled over seeds."""
     squared = {"eskf": 0.0, "fls": 0.0, "batch": 0.0}
     for seed in range(4):

@@ -100,7 +100,7 @@ def test_covariance_of_a_partial_reading_is_the_block_of_the_whole(mask: tuple[i
     assert np.allclose(C[:n, :n], whole[np.ix_(measured, measured)])
 
 
-def test_a_heading_says_nothing_when_its_axis_points_up() -> None:
+def test_a_heading_gives_no_reading_when_its_axis_points_up() -> None:
     R_WB = Rotation.from_euler("ZYX", [40, 89.0, 0], degrees=True).as_matrix()
     state = NavState(R_WB, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
     r, H, _ = residual(reading(HEADING, np.radians([70.0]), np.array([0.02])), state, Rig(NOISE))

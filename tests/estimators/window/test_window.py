@@ -117,7 +117,7 @@ def test_at_a_lag_it_reaches_gtsams_optimum(dvl: str) -> None:
     ],
     ids=["lawnmower", "yo-yo", "yo-yo at 10 s", "tight and velocity", "sparse", "late", "odd", "robust"],
 )
-def test_at_a_lag_it_reaches_gtsams_optimum_whatever_it_is_given(change: dict, options: dict) -> None:
+def test_at_a_lag_it_reaches_gtsams_optimum_for_all_sensors_and_options(change: dict, options: dict) -> None:
     log = simulate(replace(SHORT, duration_s=30.0, **change), seed=3)
     assert_one(run_log(log, create("window", **TO_OPTIMUM, **options)), run_log(log, create("fls-batch", **options)))
 
@@ -155,7 +155,7 @@ def test_over_the_whole_log_both_engines_of_batch_end_at_one_optimum(options: di
 def test_a_lag_longer_than_the_log_is_batch(mission: str) -> None:
     log = simulate(replace(MINUTE, mission=mission), seed=3)
     ours, theirs = (
-        run_log(log, create("window", lag_s=100.0, hindsight_covariance_s=60.0, **TO_OPTIMUM)),
+        run_log(log, create("window", lag_s=100.0, smoothed_covariance_s=60.0, **TO_OPTIMUM)),
         run_log(log, create("batch")),
     )
     assert np.linalg.norm(ours.smoothed.p_WB_W - theirs.smoothed.p_WB_W, axis=1).max() < 1e-3
@@ -165,7 +165,7 @@ def test_a_lag_longer_than_the_log_is_batch(mission: str) -> None:
     assert np.linalg.norm(ours.smoothed.p_WB_W - engine.smoothed.p_WB_W, axis=1).max() < 1e-5
 
 
-def test_as_shipped_it_says_what_fls_says() -> None:
+def test_as_shipped_it_equals_fls() -> None:
     """From the second tick on: at the first, iSAM2 leaves be what ours has linearised anew."""
     log = simulate(SHORT, seed=4)
     ours, theirs = run_log(log, create("window")), run_log(log, create("fls"))
@@ -194,11 +194,11 @@ def test_online_it_is_the_filter_and_least_squares_so_far(seed: int, thorough: b
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_at_a_lag_its_hindsight_is_least_squares_on_what_had_been_seen_by_then(seed: int) -> None:
-    _, hindsight = run("window", seed)
-    n = len(hindsight)
-    assert apart(hindsight, [exact(seed, min(k + LAG + 1, n))[k] for k in range(n)]) < 1e-6
-    assert apart(hindsight[: -2 * LAG], exact(seed, n)[: -2 * LAG]) > 1e-3  # the window does matter
+def test_at_a_lag_smoothed_states_are_least_squares_on_the_readings_so_far(seed: int) -> None:
+    _, smoothed = run("window", seed)
+    n = len(smoothed)
+    assert apart(smoothed, [exact(seed, min(k + LAG + 1, n))[k] for k in range(n)]) < 1e-6
+    assert apart(smoothed[: -2 * LAG], exact(seed, n)[: -2 * LAG]) > 1e-3  # the window does matter
 
 
 # --- the chain against dense least squares ---------------------------------------------------------------------------
@@ -372,7 +372,7 @@ def test_a_tie_is_the_imu_residual_solved_for_the_later_keyframe(seed: int) -> N
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_prior_said_elsewhere_is_its_residual_solved_for_the_state(seed: int) -> None:
+def test_a_prior_at_another_point_is_its_residual_solved_for_the_state(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a, mean, P = random_state(rng), 0.1 * rng.normal(size=DIM), _covariance(rng, 0.2)
     x = a.retract(0.3 * rng.normal(size=DIM))
@@ -446,12 +446,12 @@ def test_a_prior_that_is_no_covariance_is_refused() -> None:
 
 
 def _counts(log: Log, **options: object) -> dict[str, int]:
-    result = run_log(log, create("window", hindsight_covariance_s=1e6, **options))
+    result = run_log(log, create("window", smoothed_covariance_s=1e6, **options))
     assert result.status == "done", result.cause
     return result.counts
 
 
-def test_a_step_factors_two_blocks_whatever_the_lag_as_long_as_nothing_moves() -> None:
+def test_a_step_factors_two_blocks_at_any_lag_if_nothing_moves() -> None:
     """The one that gains a tie and, with it, the new one."""
     log = simulate(replace(MINUTE, **SLOW_SENSORS), seed=4)
     for lag_s in (3.0, 30.0):
@@ -486,7 +486,7 @@ def _us_per_keyframe(log: Log, name: str, **options: object) -> float:
 @pytest.mark.slow
 def test_a_lag_of_30_s_costs_at_most_twice_one_of_3_s() -> None:
     log = simulate(Scenario(duration_s=90.0, imu="tactical"), seed=4)
-    still = {"relinearize": [1e9] * 4, "hindsight_covariance_s": 1e6}
+    still = {"relinearize": [1e9] * 4, "smoothed_covariance_s": 1e6}
     us = np.array([[_us_per_keyframe(log, "window", lag_s=lag_s, **still) for lag_s in (3.0, 30.0)] for _ in range(9)])
     short, long = np.median(us[1:], axis=0)
     assert long < 2 * short, (short, long)
@@ -504,7 +504,7 @@ def test_batch_has_its_optimum_of_ten_minutes_in_two_seconds() -> None:
     assert perf_counter() - started < 2.0
 
 
-# --- honesty ---------------------------------------------------------------------------------------------------------
+# --- consistency -----------------------------------------------------------------------------------------------------
 
 
 def _nees(truth: Trajectory, track: Trajectory, at_s: float, of: slice) -> float:
@@ -513,13 +513,13 @@ def _nees(truth: Trajectory, track: Trajectory, at_s: float, of: slice) -> float
 
 
 @pytest.mark.slow
-def test_over_twenty_seeds_it_errs_as_much_as_it_says() -> None:
-    """Online and with hindsight, at three times fixed beforehand; the 0.001 is shared among them."""
+def test_over_twenty_seeds_its_errors_match_its_covariance() -> None:
+    """Online and smoothed, at three times fixed beforehand; the 0.001 is shared among them."""
     n, times_s, parts = 20, (9.0, 29.0, 49.0), (slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 15))
     total = np.zeros((2, len(times_s), len(parts)))
     for seed in range(n):
         log = simulate(replace(MINUTE, **SLOW_SENSORS), seed=seed)
-        result = run_log(log, create("window", hindsight_covariance_s=1e-3))
+        result = run_log(log, create("window", smoothed_covariance_s=1e-3))
         for o, track in enumerate((result.online, result.smoothed)):
             total[o] += [[_nees(log.truth, track, at_s, of) for of in parts] for at_s in times_s]
     for p, of in enumerate(parts):
