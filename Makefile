@@ -8,6 +8,9 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist worksteal
 
+# Python keeps the bytecode it compiles, whatever the shell says: dozens of processes read the same sources
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: bench test fast timing reference lint types warm clean
 
 bench: .venv/core
