@@ -14,7 +14,6 @@ from .state import TimeArray
 
 DVL, DEPTH, GPS, HEADING, ATTITUDE = range(5)
 """Kinds of readings, as READING and compiled code number them."""
-"""Kinds of readings, as READING and compiled code number them."""
 KIND = {"dvl": DVL, "depth": DEPTH, "gps": GPS, "heading": HEADING, "attitude": ATTITUDE}
 SENSOR = ("dvl", "depth", "gps", "heading", "heading")
 """Sensor name by kind; a full attitude comes from the heading sensor."""

@@ -9,7 +9,6 @@ from pydantic import ConfigDict, Field
 
 DEGREE = math.pi / 180
 """rad."""
-"""rad."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

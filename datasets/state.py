@@ -27,7 +27,6 @@ ACCEL_BIAS = slice(9, 12)
 GYRO_BIAS = slice(12, 15)
 DIM = 15
 """Components of the error."""
-"""Components of the error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +60,16 @@ class NavState:
         )
 
     def local(self, other: NavState) -> Array:
-        """Return the error (15,) with self ⊕ error = other; docs/conventions.md (8)."""
+        """Return the error (15,) with self ⊕ error = other; docs/conventions.md (8). Of states in rows: (n, 15)."""
         return np.concatenate(
             [
-                Rotation.from_matrix(self.R_WB.T @ other.R_WB).as_rotvec(),
+                rotation_vector(self.R_WB.swapaxes(-1, -2) @ other.R_WB),
                 other.p_WB_W - self.p_WB_W,
                 other.v_WB_W - self.v_WB_W,
                 other.b_a - self.b_a,
                 other.b_g - self.b_g,
-            ]
+            ],
+            axis=-1,
         )
 
 
@@ -80,3 +80,29 @@ class Belief:
     t_ns: int
     state: NavState
     P: Array
+
+
+def rotation_angle(R: Array) -> Array:
+    """Return the angle (...) rad of R (..., 3, 3), in [0, π], accurate near both ends; NaN where R is.
+
+    atan2(|vee(R − Rᵀ)|, tr R − 1): twice the sine over twice the cosine.
+    """
+    cosine = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0
+    return np.arctan2(np.linalg.norm(_twice_sine_axis(R), axis=-1), cosine)
+
+
+def rotation_vector(R: Array) -> Array:
+    """Return Log R (..., 3) rad, the angle along the axis: exp(Log R) = R; NaN where R is."""
+    phi, w = rotation_angle(R), _twice_sine_axis(R)
+    twice_sine = np.linalg.norm(w, axis=-1)
+    log = np.divide(phi, twice_sine, out=np.full(np.shape(phi), 0.5), where=twice_sine > 0)[..., None] * w
+    near_pi = phi > 3.0  # where the sine loses the axis
+    if near_pi.any():
+        log[near_pi] = Rotation.from_matrix(R[near_pi]).as_rotvec()
+    return log
+
+
+def _twice_sine_axis(R: Array) -> Array:
+    """Return vee(R − Rᵀ) (..., 3): the axis times twice the sine of the angle."""
+    pairs = ((2, 1), (0, 2), (1, 0))
+    return np.stack([R[..., i, j] - R[..., j, i] for i, j in pairs], axis=-1)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...datasets.state import TimeArray
+from ...datasets.state import TimeArray, rotation_angle
 from ...datasets.trajectory import Trajectory
 from .alignment import Alignment, align
 from .association import associate
-from .pose_error import Dims, heading_roll_pitch, positions, rmse, rotation_angle, statistics, travelled, wrapped
+from .pose_error import Dims, heading_roll_pitch, positions, rmse, statistics, travelled, wrapped
 
 
 @dataclass(frozen=True)

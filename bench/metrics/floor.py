@@ -42,7 +42,7 @@ from ...datasets.epochs import IMU_SAMPLE, READING, Epoch, cut
 from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario
 from ...datasets.simulated.simulator import simulate
-from ...datasets.state import DIM, LIMIT_NS, VELOCITY, Array, TimeArray
+from ...datasets.state import DIM, LIMIT_NS, VELOCITY, Array, TimeArray, rotation_vector
 from ...datasets.trajectory import Trajectory
 from ...estimators.interface import FACTORS
 from ...estimators.physics.compiled import compiled
@@ -51,7 +51,6 @@ from ...estimators.physics.imu import BLOCK, compile_rig, first_sample, integrat
 from ...estimators.physics.measurements import measure
 from ...estimators.physics.state import STATE
 from .association import ScoreError
-from .pose_error import rotation_vector
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ...datasets.state import Array
 from ...datasets.trajectory import Trajectory
@@ -45,30 +44,6 @@ def check_finite(estimate: Trajectory) -> None:
         if not finite.all() and (name == "position" or finite.any()):
             row = int(np.argmin(finite))
             raise ScoreError(f"estimate: {name} is not finite in row {row} ({estimate.t_ns[row]} ns): it diverged")
-
-
-def rotation_angle(R: Array) -> Array:
-    """Return the angle (n,) rad of R (n, 3, 3), in [0, π], accurate near both ends; NaN where R is.
-
-    atan2(|vee(R − Rᵀ)|, tr R − 1): twice the sine over twice the cosine.
-    """
-    return np.arctan2(np.linalg.norm(_twice_sine_axis(R), axis=1), R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
-
-
-def rotation_vector(R: Array) -> Array:
-    """Return Log R (n, 3) rad, the angle along the axis: exp(Log R) = R; NaN where R is."""
-    phi, w = rotation_angle(R), _twice_sine_axis(R)
-    twice_sine = np.linalg.norm(w, axis=1)
-    log = np.divide(phi, twice_sine, out=np.full_like(phi, 0.5), where=twice_sine > 0)[:, None] * w
-    near_pi = phi > 3.0  # where the sine loses the axis
-    if near_pi.any():
-        log[near_pi] = Rotation.from_matrix(R[near_pi]).as_rotvec()
-    return log
-
-
-def _twice_sine_axis(R: Array) -> Array:
-    """Return vee(R − Rᵀ) (n, 3): the axis times twice the sine of the angle."""
-    return np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
 
 
 def heading_roll_pitch(R_WB: Array) -> Array:

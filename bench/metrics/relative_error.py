@@ -8,10 +8,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from ...datasets.state import Array, TimeArray
+from ...datasets.state import Array, TimeArray, rotation_angle
 from ...datasets.trajectory import Trajectory
 from .association import ScoreError, associate
-from .pose_error import Dims, positions, rotation_angle, statistics, travelled
+from .pose_error import Dims, positions, statistics, travelled
 
 Unit: TypeAlias = Literal["frames", "s", "m"]
 Pairs: TypeAlias = Literal["consecutive", "all"]

@@ -7,10 +7,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, TimeArray
+from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState, TimeArray
 from ...datasets.trajectory import Trajectory
 from .association import ScoreError, associate
-from .pose_error import check_finite, heading_roll_pitch, rmse, rotation_vector, wrapped
+from .pose_error import check_finite, heading_roll_pitch, rmse, wrapped
 
 Block: TypeAlias = Literal["position", "attitude", "velocity", "biases", "all"]
 BLOCKS: dict[Block, slice] = {
@@ -48,15 +48,16 @@ def state_errors(truth: Trajectory, estimate: Trajectory, tolerance_ns: int = 0)
     """
     truth, estimate = associate(truth, estimate, tolerance_ns)
     check_finite(estimate)
+    e = error_state(truth, estimate)
     angles = np.degrees(wrapped(heading_roll_pitch(estimate.R_WB) - heading_roll_pitch(truth.R_WB)))
     return StateErrors(
         heading_deg=rmse(angles[:, 0]),
         roll_deg=rmse(angles[:, 1]),
         pitch_deg=rmse(angles[:, 2]),
-        velocity_m_s=rmse(_difference(truth.v_WB_W, estimate.v_WB_W, len(truth))),
-        depth_m=rmse(truth.p_WB_W[:, 2] - estimate.p_WB_W[:, 2]),
-        accel_bias_m_s2=rmse(_difference(truth.b_a, estimate.b_a, len(truth))),
-        gyro_bias_rad_s=rmse(_difference(truth.b_g, estimate.b_g, len(truth))),
+        velocity_m_s=rmse(e[:, VELOCITY]),
+        depth_m=rmse(e[:, POSITION][:, 2]),
+        accel_bias_m_s2=rmse(e[:, ACCEL_BIAS]),
+        gyro_bias_rad_s=rmse(e[:, GYRO_BIAS]),
         n=len(truth),
     )
 
@@ -171,16 +172,11 @@ def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns:
 
 def error_state(truth: Trajectory, estimate: Trajectory) -> Array:
     """Return e (n, 15) with estimate ⊕ e = truth, of associated trajectories; NaN where unknown."""
-    n = len(truth)
-    e = np.empty((n, DIM))
-    e[:, THETA] = rotation_vector(estimate.R_WB.transpose(0, 2, 1) @ truth.R_WB)
-    e[:, POSITION] = truth.p_WB_W - estimate.p_WB_W
-    e[:, VELOCITY] = _difference(estimate.v_WB_W, truth.v_WB_W, n)
-    e[:, ACCEL_BIAS] = _difference(estimate.b_a, truth.b_a, n)
-    e[:, GYRO_BIAS] = _difference(estimate.b_g, truth.b_g, n)
-    return e
+    return _states(estimate).local(_states(truth))
 
 
-def _difference(x: Array | None, y: Array | None, n: int) -> Array:
-    """Return y − x (n, 3), NaN where either is unknown."""
-    return np.full((n, 3), np.nan) if x is None or y is None else y - x
+def _states(of: Trajectory) -> NavState:
+    """Return all states of a trajectory in one, row by row; NaN where unknown."""
+    unknown = np.full((len(of), 3), np.nan)
+    v_WB_W, b_a, b_g = (unknown if x is None else x for x in (of.v_WB_W, of.b_a, of.b_g))
+    return NavState(of.R_WB, of.p_WB_W, v_WB_W, b_a, b_g)

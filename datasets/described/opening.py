@@ -12,7 +12,6 @@ from .description import read_description
 
 CATALOG = Path(__file__).parents[1] / "catalog"
 """Where the descriptions lie that come with this package."""
-"""Where the descriptions lie that come with this package."""
 
 
 class RecordingNotFound(DatasetError):  # noqa: N818  (named as FileNotFoundError's kin, without the suffix)

@@ -29,7 +29,6 @@ HEADER = np.dtype(
 )  # fmt: skip
 CHUNK_BYTES = 1 << 20
 """Read at a time: 1 MiB."""
-"""Read at a time: 1 MiB."""
 TYPES = {"int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
          "int64_t": "<i8", "fp32_t": "<f4", "fp64_t": "<f8"}  # fmt: skip
 BROKEN = (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, ValueError)

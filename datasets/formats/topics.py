@@ -22,7 +22,6 @@ from .recording import Messages, Recording, TopicInfo, Wanted, not_found
 
 NS = 1_000_000_000
 """Nanoseconds per second."""
-"""Nanoseconds per second."""
 
 
 class MalformedMessage(Exception):  # noqa: N818  (about one message; reading goes on)

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 DEGREE_OF_SPLINES = 5
 """Quintic, as in `missions`: accelerations and angular accelerations are then smooth."""
-"""Quintic, as in `missions`: accelerations and angular accelerations are then smooth."""
 STEEPEST_DEG = 80.0
 """Beyond this pitch the Euler angles change too fast for the splines."""
 TURN_LIMIT_DEG = 90.0

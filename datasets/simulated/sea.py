@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 COMPONENTS = 16
 """Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
-"""Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
 
 
 @dataclass(frozen=True, eq=False)

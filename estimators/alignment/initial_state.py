@@ -27,8 +27,9 @@ from scipy.stats import chi2
 from ...datasets.log import Log
 from ...datasets.rig import EARTH_RATE_RAD_S
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, NavState, TimeArray
+from ..physics.so3 import skew
 from .rest import REST_M_S, mean_velocity
-from .window import Window, skew
+from .window import Window
 
 MOTION_M_S2 = 0.1
 """Sigma of the vehicle's own mean acceleration in B over the window: where no sensor measures it, it appears

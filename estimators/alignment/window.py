@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ...datasets.log import Log, ReadingStream
 from ...datasets.state import Array, TimeArray
+from ..physics.so3 import skew
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +107,3 @@ def to_the_end(steps: Array) -> Array:
     sums = np.zeros((len(steps) + 1, *steps.shape[1:]))
     sums[:-1] = np.cumsum(steps[::-1], axis=0)[::-1]
     return sums
-
-
-def skew(v: Array) -> Array:
-    """Return [v]× (..., 3, 3) of vectors (..., 3)."""
-    x, y, z = np.moveaxis(np.asarray(v, float), -1, 0)
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*np.shape(x), 3, 3)

@@ -24,7 +24,7 @@ from ..interface import FACTORS, Diverged, Factors, Gate, Inflation
 from ..physics.imu import BLOCK, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
-from ..stages import clock, stage
+from ..stages import staged
 
 
 @dataclass(frozen=True)
@@ -71,30 +71,6 @@ class Kalman(ABC):
         return state["P"][0]
 
 
-class StagedKalman(Kalman):
-    """A filter whose steps are timed by stage."""
-
-    def __init__(self, kalman: Kalman) -> None:
-        self._kalman = kalman
-
-    @stage("propagation")
-    def predict(
-        self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
-    ) -> None:
-        """See `Kalman.predict`."""
-        self._kalman.predict(state, rig, before, imu, block)
-
-    @stage("solve")
-    def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
-        """See `Kalman.correct`."""
-        return self._kalman.correct(state, rig, readings)
-
-    @stage("marginal")
-    def error_covariance(self, state: NDArray[Any]) -> Array:
-        """See `Kalman.error_covariance`."""
-        return self._kalman.error_covariance(state)
-
-
 class PastEpoch(NamedTuple):
     """A processed epoch, kept for replay: the state and the IMU sample before it, and the outliers counted in it."""
 
@@ -127,7 +103,9 @@ class FilterPass:
     ) -> None:
         self.counts: Counter[str] = Counter({f"outliers_{sensor}": 0 for sensor in config.gate})
         self._config = config
-        self._kalman = StagedKalman(kalman) if clock.running else kalman
+        self._predict = staged("propagation", kalman.predict)
+        self._correct = staged("solve", kalman.correct)
+        self._covariance = staged("marginal", kalman.error_covariance)
         self._on_epoch = on_epoch
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._widths = gate_widths(config.gate) if config.gate else None
@@ -155,7 +133,7 @@ class FilterPass:
     def belief(self) -> Belief:
         """See `Pass.belief`."""
         state = as_belief(self._t_ns, self._state).state
-        return with_rate_noise(Belief(self._t_ns, state, self._kalman.error_covariance(self._state)), self._rig)
+        return with_rate_noise(Belief(self._t_ns, state, self._covariance(self._state)), self._rig)
 
     def finish(self) -> Trajectory | None:
         """Return None: a filter does not smooth."""
@@ -172,13 +150,13 @@ class FilterPass:
             while self._past[0].epoch.t_ns < horizon_ns:
                 self._past.popleft()
         if len(epoch.imu):
-            self._kalman.predict(self._state, self._rig, self._before, epoch.imu, self._block)
+            self._predict(self._state, self._rig, self._before, epoch.imu, self._block)
             self._before = epoch.imu[-1:]
         readings = epoch.readings
         if self._widths is not None and len(readings):
             readings = self._gated(readings, self._widths, outliers)
             self.counts.update(outliers)
-        if len(readings) and not self._kalman.correct(self._state, self._rig, readings):
+        if len(readings) and not self._correct(self._state, self._rig, readings):
             raise Diverged("the innovation covariance is not positive definite, or the state is not finite")
         if self._on_epoch is not None:
             self._on_epoch(epoch, self._state, self._block)
@@ -187,7 +165,7 @@ class FilterPass:
     def _gated(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
         """Return the readings that pass their gates, and count the others as outliers."""
         predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
-        predicted["P"][0] = self._kalman.error_covariance(self._state)
+        predicted["P"][0] = self._covariance(self._state)
         judge(readings, predicted, self._rig, table)
         beyond = table["nis"] > widths[readings["kind"], table["dof"]]
         if not beyond.any():

@@ -75,7 +75,10 @@ def absorb(n: int, r: Array, H: Array, C: Array, m: Array, P: Array) -> bool:
 
 @compiled
 def decorrelate(n: int, r: Array, H: Array, C: Array) -> None:
-    """Subtract from each of n rows what the rows before it say of its error: C becomes diagonal, D of L D Lᵀ."""
+    """Subtract from each of n rows what the rows before it say of its error, of covariance C = L D Lᵀ.
+
+    D stands on C's diagonal afterwards and L below it, for other columns of H.
+    """
     for k in range(n):
         for i in range(k + 1, n):
             if C[i, k] != 0.0:
@@ -85,7 +88,7 @@ def decorrelate(n: int, r: Array, H: Array, C: Array) -> None:
                     H[i, j] -= share * H[k, j]
                 for j in range(k + 1, n):
                     C[i, j] -= share * C[k, j]
-                C[i, k] = 0.0
+                C[i, k] = share
 
 
 @compiled

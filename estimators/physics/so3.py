@@ -32,12 +32,11 @@ def skew_into(a: Array, out: Array) -> None:
         out[j, k] = -a[i]
 
 
-@compiled
 def skew(a: Array) -> Array:
-    """[a]×, with skew(a) @ b = a × b."""
-    out = np.empty((3, 3))
-    skew_into(a, out)
-    return out
+    """[a]× (..., 3, 3) of vectors (..., 3), with skew(a) @ b = a × b; not compiled."""
+    x, y, z = np.moveaxis(np.asarray(a, float), -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*np.shape(x), 3, 3)
 
 
 @compiled
@@ -76,14 +75,6 @@ def inverse_transform_into(R: Array, a: Array, out: Array) -> None:
     """Write Rᵀ a into `out` (3,)."""
     for i in range(3):
         out[i] = R[0, i] * a[0] + R[1, i] * a[1] + R[2, i] * a[2]
-
-
-@compiled
-def inverse_transform(R: Array, a: Array) -> Array:
-    """Rᵀ a."""
-    out = np.empty(3)
-    inverse_transform_into(R, a, out)
-    return out
 
 
 @compiled

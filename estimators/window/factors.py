@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...datasets.state import DIM, THETA, Array
 from ..physics.blocks import clear
 from ..physics.compiled import compiled, inner
+from ..physics.elimination import add_scaled, decorrelate
 from ..physics.imu import predict, process_noise
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import exp_into, product_into, right_jacobian_into, skew_into, transform_into
@@ -47,7 +48,11 @@ FACTOR = np.dtype(
 
 @inner
 def whiten(n: int, C: Array, r: Array, H: Array, H_j: Array) -> bool:
-    """Divide n rows by the Cholesky factor of their covariance C, which is used up; False where it has none."""
+    """Make n rows of covariance C, which is used up, independent and of variance 1; False where C is no covariance."""
+    decorrelate(n, r, H, C)
+    for i in range(n):
+        for k in range(i):
+            add_scaled(H_j[i], -C[i, k], H_j[k])
     for k in range(n):
         if not C[k, k] > 0.0:
             return False
@@ -56,14 +61,6 @@ def whiten(n: int, C: Array, r: Array, H: Array, H_j: Array) -> bool:
         for j in range(DIM):
             H[k, j] /= root
             H_j[k, j] /= root
-        for i in range(k + 1, n):
-            L = C[i, k] / root
-            r[i] -= L * r[k]
-            for j in range(DIM):
-                H[i, j] -= L * H[k, j]
-                H_j[i, j] -= L * H_j[k, j]
-            for j in range(k + 1, n):
-                C[i, j] -= L * C[k, j] / root
     return True
 
 

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fathom.estimators.physics.so3 import exp, inverse_right_jacobian, log, right_jacobian, skew, wrap, yaw_of
+from fathom.estimators.physics.so3 import (
+    exp,
+    inverse_right_jacobian,
+    log,
+    right_jacobian,
+    skew,
+    skew_into,
+    wrap,
+    yaw_of,
+)
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +30,14 @@ def _vectors(angle: float) -> np.ndarray:
 def test_exp_is_the_matrix_exponential(angle: float) -> None:
     for phi in _vectors(angle):
         assert np.allclose(exp(phi), expm(skew(phi)), atol=1e-14, rtol=0)
+
+
+def test_skew_is_the_cross_product_and_the_compiled_one_is_the_same() -> None:
+    a, b, out = *np.random.default_rng(0).normal(size=(2, 50, 3)), np.empty((3, 3))
+    assert np.allclose((skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-15, rtol=1e-14)
+    for one in a:
+        skew_into(one, out)
+        assert np.array_equal(out, skew(one))
 
 
 @pytest.mark.parametrize("angle", ANGLES)
