@@ -26,8 +26,8 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
-COLUMN_IN, WIDTH_IN, PAGE_IN = 3.5, 7.16, 8.8
-"""One column of a journal's page, both, and its height."""
+COLUMN_IN, WIDTH_IN = 3.5, 7.16
+"""One column of a journal's page, and both."""
 TITLE_PT, TEXT_PT = 8, 7
 """Points: journals ask for at least 6 to 7 in print."""
 LETTER_IN = 0.6 / 72

@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from ...datasets.described.opening import RecordingNotFound
 from ..errors import ExperimentError
 from ..experiment.plan import Experiment, Run
+from ..files import writing
 from ..results.identity import content_sha256
 from ..results.store import Row, Store, provenance, sole_writer
 from .cold_start import compile_first
@@ -177,10 +178,8 @@ def _make_room(folder: Path) -> None:
         ExperimentError: they cannot be made, or something else is at a result's path.
     """
     for path in (folder / "trajectories", folder / "figures"):  # the lock lies in their parent
-        try:
+        with writing(path, "; give another --out", "made"):
             path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ExperimentError(f"{path}: cannot be made ({error.strerror}); give another --out") from None
     for path in (folder / "table.csv", folder / "consistency.csv"):
         if path.is_dir():
             raise ExperimentError(f"{path}: a folder is in the way; move it, or give another --out")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -16,8 +15,8 @@ import numpy as np
 
 from ...datasets.trajectory import Trajectory
 from ...estimators.registry import package_of
-from ..errors import ExperimentError
 from ..experiment.plan import Experiment, Run
+from ..files import write_whole, writing
 from ..metrics.scoring import Scoring
 from ..results.identity import identity
 from ..results.store import Row, provenance
@@ -108,14 +107,10 @@ class Finished:
             ExperimentError: the disk is full, or the folder cannot be written.
         """
         folder = folder / "trajectories"
-        try:
+        with writing(folder, "; the runs before are kept"):
             folder.mkdir(parents=True, exist_ok=True)
             for name, content in self.files.items():
-                unfinished = folder / f"{name}.{os.getpid()}"
-                unfinished.write_bytes(content)
-                unfinished.replace(folder / name)
-        except OSError as error:
-            raise ExperimentError(f"{folder}: cannot write ({error.strerror}); the runs before are kept") from None
+                write_whole(folder / name, content)
         return self.rows
 
 

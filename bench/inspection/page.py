@@ -9,6 +9,7 @@ from warnings import catch_warnings, filterwarnings
 
 from ...datasets.errors import DatasetError
 from ..drawing import empty_figure
+from ..files import writing
 from .inspecting import Inspection
 
 if TYPE_CHECKING:
@@ -102,10 +103,8 @@ def save_page(inspection: Inspection, file: Path) -> None:
         DatasetError: it cannot be written.
     """
     undated = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}.get(file.suffix.lower(), {})
-    try:
+    with writing(file, "; choose another place by -o", error=DatasetError):
         file.parent.mkdir(parents=True, exist_ok=True)
         with catch_warnings():  # letters that the font lacks are shown as boxes
             filterwarnings("ignore", message="Glyph", category=UserWarning)
             draw_inspection(inspection).savefig(file, dpi=130, metadata=undated)
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be written ({error.strerror}); choose another place by -o") from None

@@ -10,9 +10,9 @@ import pandas as pd
 import typer
 from rich.console import Console
 
-from ..errors import ExperimentError
 from ..execution.sweep import Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
+from ..files import writing
 from ..results.paired import paired
 from ..results.store import load_runs
 from ..results.summary import Record
@@ -63,14 +63,12 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     shown = set(zip(rows["log"], rows["label"], strict=True))
     print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
     print_remarks(rows, console)
-    try:
+    with writing(folder, "; the runs are in runs.sqlite"):
         write_table(every, folder / "table.csv")
         write_latex(every, folder / "table.tex")
         write_consistency(every, folder / "consistency.csv")
         write_paired(differences, folder / "paired.csv")
         figures = _draw_figures(every, folder, differences)
-    except OSError as error:
-        raise ExperimentError(f"{folder}: cannot be written ({error}); the runs are in runs.sqlite") from None
     say(f"{folder}: runs.sqlite, table.csv, table.tex, consistency.csv, paired.csv, {figures} figures")
     _write_report(every, plan, folder, differences)
     if outcome.standing:

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from ..metrics.bootstrap import FEWEST_SEEDS
 from ..metrics.floor_ratio import OVER
 from ..metrics.scoring import INNOVATIONS, MEDIAN
 from ..metrics.state_error import BLOCKS
 from ..results.intervals import interval_over_seeds
-from ..results.paired import FEWEST_SEEDS
 from ..results.summary import OUTLIERS, Record, groups
 from .cells import (
     ABSENT,

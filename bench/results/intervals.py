@@ -8,9 +8,10 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 
+from ..metrics.bootstrap import bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS
 from ..metrics.scoring import POOLED
-from .paired import FEWEST_SEEDS, TAKE, bootstrap_interval
+from .paired import TAKE
 from .summary import Record, groups, records, summarise
 
 RESAMPLES = 1999
@@ -30,22 +31,18 @@ def interval_over_seeds(done: Sequence[Record], score: str) -> tuple[float, floa
         score: one of `paired.OVER_SEEDS`.
     """
     known = [row for row in done if row[score] is not None]
-    if len(known) < FEWEST_SEEDS:
-        return None
     weights = tuple(float(row[POOLED[score]]) if score in POOLED else 1.0 for row in known)
     return _interval(tuple(float(row[score]) for row in known), weights, score)
 
 
 @lru_cache(maxsize=10_000)
-def _interval(values: tuple[float, ...], weights: tuple[float, ...], score: str) -> tuple[float, float]:
+def _interval(values: tuple[float, ...], weights: tuple[float, ...], score: str) -> tuple[float, float] | None:
     over = OVER_SEEDS[score]
     return bootstrap_interval(
         (np.array(values), np.array(weights)),
         lambda value, weight, axis=-1: TAKE[over](value, weight, axis),
         method="percentile" if over == "median" else "BCa",
-        seed=0,
-        confidence_level=0.95,
-        n_resamples=RESAMPLES,
+        resamples=RESAMPLES,
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,10 @@ DECIDES = ("cpu", "architecture", "c_library", "compiled_for", "simd", "blas")
 
 CHOOSES = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "GLIBC_TUNABLES")
 """Variables of the environment by which a user chooses other kernels than the processor asks for."""
+
+
+GIT_S = 60.0
+"""s: whoever waits longer for git, on a share that hangs, does without."""
 
 
 @cache
@@ -40,6 +45,16 @@ def machine() -> dict[str, Any]:
         "simd": " ".join(build.get("SIMD Extensions", {}).get("found", [])),
         "blas": f"{blas.get('name')} {blas.get('version')}",
     }
+
+
+def git(folder: Path, *arguments: str) -> str | None:
+    """Return the output of git in a folder; None where it fails, or there is none."""
+    try:
+        command = ["git", "-C", str(folder), *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=GIT_S)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
 
 
 def _cpu_model() -> str:

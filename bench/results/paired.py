@@ -5,8 +5,6 @@ All variants run on the same log of a seed, so the two scores of a seed are a pa
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -17,12 +15,10 @@ import scipy  # its stats load when they are first asked for
 
 from ...datasets.state import Array
 from ..metrics.association import ScoreError
+from ..metrics.bootstrap import FEWEST_SEEDS, bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS, Comparison, Over
 from ..metrics.scoring import POOLED
 from .summary import Record, groups, records
-
-FEWEST_SEEDS = 5
-"""With fewer there is neither interval nor test: even five seeds that all agree have a p of 0.06."""
 
 
 @dataclass(frozen=True)
@@ -104,9 +100,9 @@ def difference(
 
     data, method = (v, n_v, b, n_b), "percentile" if over == "median" else "BCa"
     positive, enough = bool((np.minimum(v, b) > 0).all()), len(v) >= FEWEST_SEEDS
-    options = {"confidence_level": level, "n_resamples": resamples, "method": method, "seed": seed}
-    low, high = bootstrap_interval(data, subtracted, **options) if enough else (None, None)
-    ratio_low, ratio_high = bootstrap_interval(data, divided, **options) if enough and positive else (None, None)
+    options = method, level, resamples, seed
+    low, high = bootstrap_interval(data, subtracted, *options) or (None, None)
+    ratio_low, ratio_high = (positive and bootstrap_interval(data, divided, *options)) or (None, None)
     d = v - b
     return Difference(
         pairs=len(v),
@@ -187,36 +183,6 @@ TAKE: dict[Over, Callable[[Array, Array, int], Array]] = {
     "median": lambda x, n, axis: np.median(x, axis=axis),
 }
 """How scores are pooled over seeds: functions of (scores, weights, axis)."""
-
-
-def bootstrap_interval(
-    data: tuple[Array, ...], statistic: Callable[..., Array], method: str, seed: int, **options: Any
-) -> tuple[float, float]:
-    """Return the bootstrap interval of a statistic over seeds.
-
-    Args:
-        data: (n,) arrays, which are resampled together, seed by seed.
-        statistic: of such arrays, along `axis`.
-        method: "BCa" or "percentile"; "percentile" also where BCa is not defined.
-        seed, options: of `scipy.stats.bootstrap`.
-    """
-    each = np.arange(len(data[0]))
-    without = np.array([statistic(*(x[each != k] for x in data)) for k in each])
-    value = float(statistic(*data))
-    scale = max(float(np.abs(x).max()) for x in (without, *data[::2]))
-    if method == "BCa" and np.ptp(without) <= 1e-12 * scale:  # all resamples are equal
-        return value, value
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
-        for name in (method, "percentile"):  # where BCa is not defined
-            interval = scipy.stats.bootstrap(
-                data, statistic, paired=True, vectorized=True, batch=2000, method=name,
-                rng=np.random.default_rng(seed), **options,
-            ).confidence_interval  # fmt: skip
-            low, high = float(interval.low), float(interval.high)
-            if math.isfinite(low) and math.isfinite(high):
-                break
-    return low, high
 
 
 # -- of a table of runs -----------------------------------------------------------------------------------------------

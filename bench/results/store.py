@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from functools import cache
@@ -15,10 +14,11 @@ from typing import Any
 import pandas as pd
 
 from ..errors import ExperimentError
+from ..files import writing
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import COSTS, INNOVATIONS, SCORES
 from .identity import FINAL, versions
-from .machine import machine
+from .machine import git, machine
 
 Row = Mapping[str, Any]
 
@@ -202,13 +202,9 @@ def provenance() -> dict[str, str]:
 def _commit() -> str:
     """Return the commit of the checkout this file belongs to ("-dirty" where edited), else the package's version."""
     here = Path(__file__)
-    git = ["git", "-C", str(here.parent)]
-    try:
-        subprocess.run([*git, "ls-files", "--error-unmatch", here.name], capture_output=True, check=True, timeout=20)
-        describe = [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-        return subprocess.run(describe, capture_output=True, check=True, text=True, timeout=20).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return f"fathom-bench {versions()['fathom-bench']}"
+    known = git(here.parent, "ls-files", "--error-unmatch", here.name) is not None
+    commit = git(here.parent, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*") if known else None
+    return commit or f"fathom-bench {versions()['fathom-bench']}"
 
 
 @contextmanager
@@ -221,10 +217,8 @@ def sole_writer(folder: Path) -> Iterator[None]:
     import fcntl
 
     path = folder / "lock"
-    try:
+    with writing(path, "; give another --out"):
         handle = path.open("a+b", buffering=0)
-    except OSError as error:
-        raise ExperimentError(f"{path}: cannot be written ({error.strerror}); give another --out") from None
     with handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

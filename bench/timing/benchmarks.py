@@ -85,7 +85,7 @@ def write_inputs(folder: Path, chosen: Iterable[Benchmark]) -> None:
         write_folder(log, folder / name)
         if name == "short":
             write_folder(log, folder / "short as csv", "csv")
-    _tracks()[1].to_tum(folder / "track.tum")
+    random_walk()[1].to_tum(folder / "track.tum")
     if any(each.group == "report" for each in chosen):
         run_experiment(Experiment.from_dict(ROWS), out=folder, jobs=1)
 
@@ -98,21 +98,21 @@ def _log(folder: Path, name: str) -> Any:
 
 
 @cache
-def _tracks() -> tuple[Any, Any]:
-    """Return a random walk of POSES poses at 10 Hz, and an estimate of it with errors."""
+def random_walk(n: int = POSES) -> tuple[Any, Any]:
+    """Return a random walk of n poses at 10 Hz, and an estimate of it with errors."""
     import numpy as np
     from scipy.spatial.transform import Rotation
 
     from ...datasets import Trajectory
 
     rng = np.random.default_rng(0)
-    R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.1, (POSES, 3)), axis=0))
-    p_WB_W = np.cumsum(rng.normal(0, 0.2, (POSES, 3)), axis=0)
-    t_ns = np.arange(POSES, dtype=np.int64) * 10**8
-    errs = R * Rotation.from_rotvec(rng.normal(0, 0.1, (POSES, 3)))
-    P = np.broadcast_to(0.01 * np.eye(15), (POSES, 15, 15)).copy()
-    v, b = np.zeros((POSES, 3)), np.zeros((POSES, 3))
-    estimate = Trajectory(t_ns, errs.as_matrix(), p_WB_W + rng.normal(0, 0.3, (POSES, 3)), v, b, b, P)
+    R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.1, (n, 3)), axis=0))
+    p_WB_W = np.cumsum(rng.normal(0, 0.2, (n, 3)), axis=0)
+    t_ns = np.arange(n, dtype=np.int64) * 10**8
+    errs = R * Rotation.from_rotvec(rng.normal(0, 0.1, (n, 3)))
+    P = np.broadcast_to(0.01 * np.eye(15), (n, 15, 15)).copy()
+    v, b = np.zeros((n, 3)), np.zeros((n, 3))
+    estimate = Trajectory(t_ns, errs.as_matrix(), p_WB_W + rng.normal(0, 0.3, (n, 3)), v, b, b, P)
     return Trajectory(t_ns, R.as_matrix(), p_WB_W, v, b, b), estimate
 
 
@@ -219,7 +219,7 @@ def _simulation(folder: Path) -> Work:
 def _score(folder: Path, name: str, **options: Any) -> Work:
     from ... import bench
 
-    truth, estimate = _tracks()
+    truth, estimate = random_walk()
     score = getattr(bench, name)
     return Work(lambda: score(truth, estimate, **options), POSES)
 

@@ -29,7 +29,7 @@ from ..metrics.scoring import scores
 from . import evo
 from .budgets import Budget, Measured, take_turns
 from .compiling import compile_cpu_seconds
-from .whole_runs import finished_again_mb, finished_again_s, whole_run
+from .whole_runs import finished_again_mb, finished_again_s, plan_of, whole_run
 
 LAGS_S = (3.0, 10.0, 30.0)
 """The lags of the main experiment, and a long one."""
@@ -137,14 +137,7 @@ def simulation_against_filter() -> Measured:
 
 def two_workers_against_one() -> Measured:
     """Measure the rate of two worker processes over that of one, on 100 runs, the workers being warm."""
-    plan = {
-        "name": "workers",
-        "description": "Many runs.",
-        "logs": [{"scenario": {"duration_s": 60.0}}],
-        "estimators": [{"name": "eskf"}],
-        "seeds": RUNS + WARM_RUNS,
-    }
-    experiment = Experiment.from_dict(plan)
+    experiment = Experiment.from_dict(plan_of(60.0, RUNS + WARM_RUNS))
 
     def rate(jobs: int) -> float:
         tasks, started = [Task.of(experiment, run) for run in experiment.runs()], 0.0

@@ -98,9 +98,9 @@ class Comparison:
     rows: tuple[Compared, ...]
 
     @property
-    def failed(self) -> bool:
-        """Whether anything is slower or broken."""
-        return any(row.verdict in ("slower", "broken") for row in self.rows)
+    def failed(self) -> list[str]:
+        """Names of what is slower or broken."""
+        return [row.name for row in self.rows if row.verdict in ("slower", "broken")]
 
 
 Progress = Callable[[str, float], None]
@@ -282,9 +282,8 @@ def print_comparison(
         if row.note:
             print(f"{row.name}: {row.note}")
     save(out, {"comparison": asdict(found) | {"effort": asdict(effort)}})
-    slow = [row.name for row in found.rows if row.verdict in ("slower", "broken")]
-    print(f"slower or broken: {'; '.join(slow)}" if slow else "nothing is slower")
-    return not slow
+    print(f"slower or broken: {'; '.join(found.failed)}" if found.failed else "nothing is slower")
+    return not found.failed
 
 
 def _figures(value: float | None) -> str:

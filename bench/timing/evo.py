@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ...datasets import Trajectory
 from ..metrics import ate, rpe
+from .benchmarks import random_walk
 
 TOLERANCE = 1e-9
 """In metres and in degrees."""
@@ -35,7 +35,7 @@ def compare(n: int, repeats: int = 5) -> Compared:
     """
     import evo  # noqa: F401  # before anything takes long
 
-    truth, estimate = tracks(n)
+    truth, estimate = random_walk(n)
     ours = [_ours(truth, estimate)[0] for _ in range(repeats)]
     started = time.process_time()
     theirs = list(_theirs(truth, estimate))
@@ -47,19 +47,6 @@ def compare(n: int, repeats: int = 5) -> Compared:
         abs(getattr(our, pattern.format(name)) - their[name]) for our, pattern, their in pairs for name in STATISTICS
     ]
     return Compared(tuple(evo_s / each for each in ours), max(differences))
-
-
-def tracks(n: int) -> tuple[Trajectory, Trajectory]:
-    """Return a random walk of n poses, and an estimate of it with errors."""
-    rng = np.random.default_rng(0)
-    R = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.1, (n, 3)), axis=0))
-    p_WB_W = np.cumsum(rng.normal(0, 0.2, (n, 3)), axis=0)
-    errs = R * Rotation.from_rotvec(rng.normal(0, 0.1, (n, 3)))
-    t_ns = np.arange(n, dtype=np.int64) * 10**8
-    return (
-        Trajectory(t_ns, R.as_matrix(), p_WB_W),
-        Trajectory(t_ns, errs.as_matrix(), p_WB_W + rng.normal(0, 0.3, (n, 3))),
-    )
 
 
 def _ours(truth: Trajectory, estimate: Trajectory) -> tuple[float, tuple[Any, Any]]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import ExperimentError
+from ..files import writing
 from ..results.store import provenance
 
 Named = TypeVar("Named")
@@ -57,10 +58,8 @@ def save(out: Path | None, content: Mapping[str, Any]) -> None:
         return
     of = provenance()
     made = {"commit": of["commit_id"], "versions": json.loads(of["versions"]), "machine": machine()}
-    try:
+    with writing(out, error=TimingError):
         out.write_text(json.dumps({**content, **made}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise TimingError(f"{out}: cannot be written ({error.strerror})") from None
 
 
 def made(folder: Path) -> Path:
@@ -69,10 +68,8 @@ def made(folder: Path) -> Path:
     Raises:
         TimingError: it cannot be made.
     """
-    try:
+    with writing(folder, "; give another --out", "made", TimingError):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TimingError(f"{folder}: cannot be made ({error.strerror}); give another --out") from None
     return folder
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..execution.child import Child, start
+from ..results.machine import git
 from .printing import TimingError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -119,11 +120,11 @@ def started(*sides: Side) -> Iterator[list[Worker]]:
 
 def working_tree() -> Tree:
     """Return the tree that this file is in, as it is, uncommitted changes included."""
-    if not (ROOT / "pyproject.toml").is_file() or _git("rev-parse", "--is-inside-work-tree") is None:
+    if not (ROOT / "pyproject.toml").is_file() or git(ROOT, "rev-parse", "--is-inside-work-tree") is None:
         raise TimingError(
             f"{ROOT}: no git checkout of fathom; `fathom timing against` compares a checkout with its history"
         )
-    described = _git("describe", "--always", "--dirty", "--exclude=*") or "unknown"
+    described = git(ROOT, "describe", "--always", "--dirty", "--exclude=*") or "unknown"
     return Tree(f"working tree ({described})", ROOT, Path(sys.executable), "this environment")
 
 
@@ -135,23 +136,23 @@ def checked_out(revision: str, folder: Path) -> Iterator[Tree]:
         TimingError: there is no such revision, or its dependencies cannot be installed.
     """
     _remove_stale()
-    commit = _git("rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}")
+    commit = git(ROOT, "rev-parse", "--verify", "--quiet", f"{revision}^{{commit}}")
     if commit is None:
         shallow = (
             " (this clone is shallow: `git fetch --unshallow`)"
-            if _git("rev-parse", "--is-shallow-repository") == "true"
+            if git(ROOT, "rev-parse", "--is-shallow-repository") == "true"
             else ""
         )
         raise TimingError(f"{revision}: no such revision of {ROOT}{shallow}")
-    name = f"{revision} ({commit[:9]} {_git('log', '-1', '--format=%s', commit)})"
+    name = f"{revision} ({commit[:9]} {git(ROOT, 'log', '-1', '--format=%s', commit)})"
     path = folder / f"{PREFIX}{os.getpid()}"
-    if _git("worktree", "add", "--detach", "--quiet", str(path), commit) is None:
+    if git(ROOT, "worktree", "add", "--detach", "--quiet", str(path), commit) is None:
         raise TimingError(f"{name}: git cannot check it out into {folder}")
     try:
         python, environment = _environment(path, folder / "environment")
         yield Tree(name, path, python, environment)
     finally:
-        _git("worktree", "remove", "--force", str(path))
+        git(ROOT, "worktree", "remove", "--force", str(path))
 
 
 def _environment(tree: Path, folder: Path) -> tuple[Path, str]:
@@ -203,13 +204,13 @@ def _canonical(name: str) -> str:
 
 def _remove_stale() -> None:
     """Remove the worktrees that killed comparisons left behind."""
-    _git("worktree", "prune")
-    for line in (_git("worktree", "list", "--porcelain") or "").splitlines():
+    git(ROOT, "worktree", "prune")
+    for line in (git(ROOT, "worktree", "list", "--porcelain") or "").splitlines():
         path = Path(line.removeprefix("worktree "))
         if line.startswith("worktree ") and path.name.startswith(PREFIX):
             process = path.name.removeprefix(PREFIX)
             if process.isdigit() and not _is_alive(int(process)):
-                _git("worktree", "remove", "--force", str(path))
+                git(ROOT, "worktree", "remove", "--force", str(path))
                 shutil.rmtree(path.parent, ignore_errors=True)
 
 
@@ -221,12 +222,3 @@ def _is_alive(process: int) -> bool:
     except PermissionError:
         return True
     return True
-
-
-def _git(*arguments: str) -> str | None:
-    """Return the output of git, or None if it fails."""
-    try:
-        done = subprocess.run(["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=False)
-    except OSError:
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None

@@ -29,7 +29,8 @@ ROUNDS = 5
 """Of which the sums are compared."""
 
 
-def _experiment(duration_s: float, seeds: int, estimator: str = "eskf") -> dict[str, Any]:
+def plan_of(duration_s: float, seeds: int, estimator: str = "eskf") -> dict[str, Any]:
+    """Return a plan of one estimator on many seeds of one mission."""
     return {
         "name": "runs",
         "description": "Many runs.",
@@ -49,7 +50,7 @@ def whole_run(duration_s: float) -> Measured:
 def serve(connection: Any, duration: str) -> None:
     """In a process like a worker's: let whole runs and their work alone take turns, and send what they took."""
     duration_s = float(duration)
-    experiment = Experiment.from_dict(_experiment(duration_s, 1000))
+    experiment = Experiment.from_dict(plan_of(duration_s, 1000))
     tasks = iter([Task.of(experiment, run) for run in experiment.runs()])
     scenario, estimator, bench = Scenario(duration_s=duration_s), create("eskf"), WorkerCache()
 
@@ -95,7 +96,7 @@ def _again(n: int) -> tuple[float, float, float]:
 
     One run is made. Its row and its trajectories stand for all others, under their own seeds and identities.
     """
-    plan = _experiment(20.0, n, "dead-reckoning")
+    plan = plan_of(20.0, n, "dead-reckoning")
     experiment = Experiment.from_dict(plan)
     tasks = [Task.of(experiment, run) for run in experiment.runs()]
     with TemporaryDirectory() as temporary:

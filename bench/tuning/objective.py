@@ -14,10 +14,11 @@ from scipy.stats import chi2
 from ...datasets.errors import nearest
 from ...datasets.state import Array
 from ..errors import ExperimentError
+from ..metrics.bootstrap import bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
-from ..results.paired import FEWEST_SEEDS, TAKE, bootstrap_interval
+from ..results.paired import TAKE
 
 EXPECTED: dict[str, float] = (
     dict.fromkeys(INNOVATIONS, 1.0)
@@ -29,10 +30,6 @@ EXPECTED: dict[str, float] = (
 
 SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(INNOVATIONS)
 """Scores that a search can minimise. Costs do not depend on the noise, and the floor not on the estimator."""
-
-
-BOOTSTRAP = {"confidence_level": 0.95, "n_resamples": 9999}
-"""Of every interval: scipy's own number of resamples."""
 
 
 class Marks(NamedTuple):
@@ -104,10 +101,7 @@ class Objective:
 
     def interval(self, marks: Marks) -> tuple[float, float] | None:
         """Return the 95 % bootstrap interval over runs of the score; None where they are too few."""
-        if len(marks.values) < FEWEST_SEEDS:
-            return None
-        v, n = marks
-        return bootstrap_interval((v, n, v), lambda v, n, _, axis=-1: self.taken(v, n, axis), "BCa", 0, **BOOTSTRAP)
+        return bootstrap_interval(tuple(marks), self.taken)
 
     def gain(self, tuned: Marks, sheet: Marks) -> tuple[float, tuple[float, float] | None]:
         """Return the gain of the tuned over the data sheet, and its 95 % bootstrap interval, paired by run.
@@ -121,8 +115,7 @@ class Objective:
             return of_b - of_v if self.is_distance else np.log(of_b / of_v)
 
         data = (tuned.values, tuned.weights, sheet.values, sheet.weights)
-        enough = len(tuned.values) >= FEWEST_SEEDS
-        return float(less(*data)), bootstrap_interval(data, less, "BCa", 0, **BOOTSTRAP) if enough else None
+        return float(less(*data)), bootstrap_interval(data, less)
 
     def gain_of(self, tuned: float, sheet: float) -> float:
         """Return the gain between two losses."""

@@ -18,8 +18,9 @@ from rich.table import Table
 
 from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..errors import ExperimentError
+from ..files import writing
+from ..metrics.bootstrap import FEWEST_SEEDS
 from ..output.tables import terminal
-from ..results.paired import FEWEST_SEEDS
 from .objective import EXPECTED, Marks
 from .search import Search, Trial, best_of
 from .tuning import Tuning
@@ -163,7 +164,7 @@ def write_outcome(outcome: Outcome) -> list[Path]:
     """
     folder = outcome.tuning.folder
     table, spec = folder / "trials.csv", folder / "tuned.yaml"
-    try:
+    with writing(folder, "; the trials are kept"):
         with table.open("w", encoding="utf-8", newline="") as file:
             write = csv.writer(file).writerow
             write(["trial", *outcome.tuning.dials, "loss", "cause"])
@@ -171,8 +172,6 @@ def write_outcome(outcome: Outcome) -> list[Path]:
                 write([trial.number, *(trial.factors[dial] for dial in outcome.tuning.dials), trial.loss, trial.cause])
         spec.write_text(outcome.spec(), encoding="utf-8")
         return [table, spec, *save(draw_search(outcome), folder / "factors")]
-    except OSError as error:
-        raise ExperimentError(f"{folder}: cannot be written ({error}); the trials are kept") from None
 
 
 def draw_search(outcome: Outcome) -> Figure:

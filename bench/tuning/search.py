@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from ..errors import ExperimentError
 from ..execution.pool import run_all
 from ..experiment.plan import Run
+from ..files import writing
 from ..results.identity import FINAL
 from ..results.store import Row, Store, sole_writer
 from ..results.summary import groups, records
@@ -209,10 +210,8 @@ def searching(tuning: Tuning) -> Iterator[Search]:
     except ImportError as error:
         raise ExperimentError(f"{error}; tuning needs an extra: pip install 'fathom-bench[tune]'") from None
     path = tuning.folder / "study.sqlite"
-    try:
+    with writing(tuning.folder, "; give another --out", "made"):
         tuning.folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExperimentError(f"{tuning.folder}: cannot be made ({error.strerror}); give another --out") from None
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # its messages are replaced by ours
     with sole_writer(tuning.folder), Store(tuning.folder / "runs.sqlite") as store:
         try:

@@ -17,7 +17,7 @@ from ..errors import DatasetError, complaints, nearest
 from ..formats.columns import Column, Part, Table
 from ..formats.recording import Recording, loader
 from ..mounting import Matrix, MountingSpec
-from ..quantities import Finite, NotNegative, Positive, Vector
+from ..quantities import DEGREE, Finite, NotNegative, Positive, Vector
 from ..rig import ImuNoise
 from ..state import LIMIT_NS, Array, Belief, NavState
 
@@ -112,7 +112,7 @@ class Velocity(Speeds):
 class Rate(Quantity):
     """Three angular rates."""
 
-    units = {"rad/s": 1.0, "deg/s": np.pi / 180}
+    units = {"rad/s": 1.0, "deg/s": DEGREE}
     width = 3
 
 
@@ -126,7 +126,7 @@ class Acceleration(Quantity):
 class Angle(Quantity):
     """One angle."""
 
-    units = {"rad": 1.0, "deg": np.pi / 180}
+    units = {"rad": 1.0, "deg": DEGREE}
     width = 1
 
 

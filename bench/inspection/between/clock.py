@@ -11,8 +11,8 @@ from scipy.stats import chi2
 
 from ....datasets.log import Log
 from ..findings.finding import Check, Finding
+from ..streams.channels import seconds
 from .fitting import FALSE_ALARM, Estimate
-from .inertial import seconds
 from .pair_check import Delay
 
 if TYPE_CHECKING:

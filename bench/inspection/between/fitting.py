@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from ....datasets.state import Array
+from ..streams.neighbours import MAD_TO_SIGMA
 
 BLOCKS = 12
 """Enough for 11 degrees of freedom, few enough that errors of one block hardly reach into the next."""
@@ -121,7 +122,7 @@ def least_squares(columns: dict[str, Array], y: Array, block: Index) -> Fit | No
             return None
         beta, cov = _jackknife(X[kept], y[kept], block[kept])
         residual = y - X @ beta
-        kept = np.abs(residual) <= 6 * 1.4826 * np.median(np.abs(residual)) + 1e-12
+        kept = np.abs(residual) <= 6 * MAD_TO_SIGMA * np.median(np.abs(residual)) + 1e-12
     return Fit(tuple(columns), beta, cov, int(np.count_nonzero(count)) - 1, residual, kept)
 
 

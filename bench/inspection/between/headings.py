@@ -9,8 +9,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from ....datasets.log import Log
+from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
+from ..streams.channels import seconds
 from .fitting import (
     BLOCKS,
     Estimate,
@@ -24,15 +26,13 @@ from .fitting import (
     windows_of,
     without_trend,
 )
-from .inertial import LEVEL_S, Inertial, headings, seconds
+from .inertial import LEVEL_S, Inertial, headings
 from .pair_check import Delay, PairCheck
 from .path_fit import fit_path, positions
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DEGREE = np.pi / 180
-"""rad."""
 WINDOW_S = 60.0
 """A mean is removed per window: a consumer gyro's bias drifts by under 0.1° in it, and a turn still fits."""
 LAGS_S = np.arange(-3.0, 3.01, 0.25)

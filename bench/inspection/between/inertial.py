@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from ....datasets.log import Log
-from ....datasets.state import Array, TimeArray
+from ....datasets.state import Array
+from ..streams.channels import seconds
+from ..streams.norms import onto_z
 
 LEVEL_S = 2.0
 """The accelerometers are averaged over this. In turns the vehicle's own acceleration tilts the level by a degree or
@@ -85,13 +86,8 @@ def inertial_of(log: Log) -> Inertial:
     if up_B[2] < np.cos(UPSIDE_DOWN):
         other_axes = R_BI @ np.diag([1.0, -1.0, -1.0]) @ R_BI.T
         flipped = bool(other_axes[2] @ up_B > np.cos(ALONG_AN_AXIS))
-        R_LB = other_axes if flipped else _onto_z(_nearest_axis(up_B))
+        R_LB = other_axes if flipped else onto_z(_nearest_axis(up_B))
     return Inertial(t_s, dt_s, w_B @ R_LB.T, f_B @ R_LB.T, up_each @ R_LB.T, R_LB, up_B, flipped)
-
-
-def seconds(log: Log, t_ns: TimeArray) -> Array:
-    """Return times from the log's start, s."""
-    return np.asarray((t_ns - log.start_ns) * 1e-9, dtype=np.float64)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -117,12 +113,3 @@ def _nearest_axis(up: Array) -> Array:
     best = int(np.argmax(np.abs(up)))
     axis = np.sign(up[best]) * np.eye(3)[best]
     return axis if axis @ up > np.cos(ALONG_AN_AXIS) else up
-
-
-def _onto_z(up: Array) -> Array:
-    """Return the shortest rotation that takes `up` to z; half a turn about x where it points straight down."""
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    sine = float(np.linalg.norm(axis))
-    angle = np.arctan2(sine, up[2])
-    axis = np.array([1.0, 0.0, 0.0]) if sine < 0.1 and up[2] < 0 else axis / max(sine, 1e-12)
-    return Rotation.from_rotvec(angle * axis).as_matrix()

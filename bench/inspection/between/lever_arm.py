@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ....datasets.log import DvlStream, Log
+from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
 from .fitting import BLOCKS, Estimate, Fit, Index, blocks_of_windows, least_squares, windows_of, without_trend
@@ -26,8 +27,6 @@ from .path_fit import velocities
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DEGREE = np.pi / 180
-"""rad."""
 WINDOW_S = 20.0
 """A start velocity and gravity are fitted per window: long enough for a turn, short enough for a consumer IMU."""
 DEGREE_OF_TREND = 2
@@ -248,13 +247,18 @@ def _fit(moved: Strapdown, t_s: Array, z: Array, window: Index, guess: _Guess) -
     return least_squares(every, -left.ravel(), np.repeat(blocks_of_windows(window), 3))
 
 
-def _first_yaw(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> float:
-    """Return the DVL's yaw in L from a fit without a guess; zero if that does not determine it."""
+def _coarse(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> tuple[dict[str, Array], Array]:
+    """Return columns and right-hand side of a fit without a guess: a parabola per window covers the gyro's bias."""
     R, V, w = (moved.at(t_s - delay_s, name) for name in ("R", "V", "w"))
     columns = {"along": _turn(R, z), "across": _turn(R, cross(UNIT[2], z))}
     columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
     every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, 2)
-    y = every.pop("V")
+    return every, every.pop("V")
+
+
+def _first_yaw(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: float) -> float:
+    """Return the DVL's yaw in L from a fit without a guess; zero if that does not determine it."""
+    every, y = _coarse(moved, t_s, z, window, delay_s)
     fit = least_squares(every, y, np.repeat(blocks_of_windows(window), 3))
     if fit is None:
         return 0.0
@@ -264,16 +268,12 @@ def _first_yaw(moved: Strapdown, t_s: Array, z: Array, window: Index, delay_s: f
 
 
 def _best_lag(moved: Strapdown, t_s: Array, z: Array, window: Index) -> float | None:
-    """Return the delay (s) on a coarse grid with the least residual; a parabola per window covers the gyro's bias."""
+    """Return the delay (s) on a coarse grid with the least residual."""
     some = np.isin(window, np.unique(np.linspace(0, window[-1], 40).astype(np.intp)))
     t_s, z, window = t_s[some], z[some], window[some]
     left = []
     for lag in LAGS_S:
-        R, V, w = (moved.at(t_s - lag, name) for name in ("R", "V", "w"))
-        columns = {"along": _turn(R, z), "across": _turn(R, cross(UNIT[2], z))}
-        columns |= {f"arm {axis}": _turn(R, cross(w, UNIT[i])) for i, axis in enumerate("xyz")}
-        every = _in_windows({**columns, "V": V - V.mean(axis=0)}, t_s, window, 2)
-        y = every.pop("V")
+        every, y = _coarse(moved, t_s, z, window, lag)
         X = np.stack(list(every.values()), axis=1)
         beta = np.linalg.lstsq(X, y, rcond=1e-9)[0]
         left.append(float(np.median(np.abs(y - X @ beta))))

@@ -12,8 +12,9 @@ import numpy as np
 
 from ....datasets.log import Log
 from ....datasets.state import Array
+from ..streams.channels import seconds
 from .fitting import BLOCKS, Estimate, Fit, Index, Mask, Plane, blocks_of_windows, least_squares, stacked, without_trend
-from .inertial import Inertial, seconds, yaw_by_heading
+from .inertial import Inertial, yaw_by_heading
 
 POSITION_PERIOD_S = 0.5
 """Positions closer than this are thinned: they add rows but no information at the speed of a vehicle."""

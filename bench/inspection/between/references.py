@@ -10,10 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ....datasets.log import Log
+from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
+from ..streams.channels import seconds
 from .fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
-from .inertial import Inertial, cross, seconds
+from .inertial import Inertial, cross
 from .pair_check import Delay, PairCheck
 from .path_fit import velocities
 from .velocity import SCALE_MATTERS
@@ -21,8 +23,6 @@ from .velocity import SCALE_MATTERS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DEGREE = np.pi / 180
-"""rad."""
 DRIFT_MATTERS_M_S = 0.02
 """A velocity that is off its own positions by this would be the largest part of most velocity scores."""
 OFFSET_MATTERS_M = 1.0

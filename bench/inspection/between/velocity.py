@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ....datasets.log import Log
+from ....datasets.quantities import DEGREE
 from ..findings.finding import Check, Finding
 from .inertial import Inertial
 from .pair_check import Delay, PairCheck
@@ -15,8 +16,6 @@ from .path_fit import PathFit, Positions, fit_path
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DEGREE = np.pi / 180
-"""rad."""
 SCALE_MATTERS = 0.01
 """Relative: what a low-cost DVL is specified to (Water Linked A50: 1.01 % long-term)."""
 TURN_MATTERS = 1.0 * DEGREE

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ....datasets.log import AttitudeStream, Log, ReadingStream
+from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
 from .quantisation import Quantisation, quantisation_of
 
-DEGREE = np.pi / 180
-"""rad."""
 XYZ, ENU = ("x", "y", "z"), ("east", "north", "up")
 
 
@@ -61,6 +60,11 @@ class Channel:
         """The resolution of each axis."""
         return [quantisation_of(axis) for axis in self.raw.T]
 
+    @property
+    def sigma_key(self) -> str:
+        """The key of log.yaml that states the sigma of one reading of an aiding sensor."""
+        return f"streams.{self.stream}." + {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(self.stream, "sigma_m")
+
     def rows(self, chosen: NDArray[np.bool_]) -> Channel:
         """Return the channel with only some of its rows."""
         return replace(self, t_ns=self.t_ns[chosen], x=self.x[chosen])
@@ -104,3 +108,8 @@ def _turned(stream: AttitudeStream) -> Array:
     R_WH = stream.z.reshape(-1, 3, 3)
     steps = Rotation.from_matrix(R_WH[:-1].transpose(0, 2, 1) @ R_WH[1:]).as_rotvec().reshape(-1, 3)
     return np.vstack([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+
+def seconds(log: Log, t_ns: TimeArray) -> Array:
+    """Return times from the log's start, s."""
+    return np.asarray((t_ns - log.start_ns) * 1e-9, dtype=np.float64)

@@ -107,3 +107,9 @@ def _spread_thereabouts(values: Array) -> Array:
     padded = np.vstack([spread[:1], spread, spread[-1:]])
     widest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), np.maximum(padded[2:], overall))
     return np.repeat(widest, np.diff(edges), axis=0).reshape(values.shape)
+
+
+def stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the stretches in which a mask (n,) is true, by their first and their last row."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]

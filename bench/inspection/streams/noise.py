@@ -11,9 +11,9 @@ from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
 from ..findings.panels import colour_of
-from .channels import Channel, channels_of
+from .channels import Channel, channels_of, seconds
 from .missing import readings_of
-from .neighbours import noise_sigma, residuals, rounding_sigma, spread_by_block
+from .neighbours import noise_sigma, residuals, rounding_sigma, spread_by_block, stretches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,11 +87,9 @@ def _changing(log: Log, channel: Channel, measured: NDArray[np.bool_], rounding:
     noisy = times > NOISIER
     if noisy.mean() < NOISY_SHARE:
         return []
-    runs = np.flatnonzero(np.diff(np.concatenate([[False], noisy, [False]]).astype(int))).reshape(-1, 2)
-    first, last = runs[np.argmax(runs[:, 1] - runs[:, 0])]
-    begin_s, end_s = (
-        (int(channel.t_ns[row]) - log.start_ns) * 1e-9 for row in (int(edges[first]), int(edges[last]) - 1)
-    )
+    first, last = max(stretches(noisy), key=lambda stretch: stretch[1] - stretch[0])
+    rows = int(edges[first]), int(edges[last + 1]) - 1
+    begin_s, end_s = seconds(log, channel.t_ns[list(rows)])
     message = (
         f"{channel.name} is {np.median(times[noisy]):.1f} times as noisy as usual in {noisy.mean():.0%} of the log, "
         f"longest from {begin_s:.0f} to {end_s:.0f} s: no single sigma is right for all of it."
@@ -115,9 +113,8 @@ def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
         f"{channel.of_axis(k)} scatters from reading to reading by {channel.text(float(found[k]))}, {how} the stated "
         f"sigma ({channel.text(float(channel.sigma[k]))})."
     )
-    key = {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(channel.stream, "sigma_m")
     values = [f"{found[j] * channel.shown:.2g}" if np.isfinite(channel.sigma[j]) else ".inf" for j in range(len(found))]
-    fix = f"streams.{channel.stream}.{key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
+    fix = f"{channel.sigma_key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
     if not large:
         message += " The stated one is right only if most of the error is slow, which this check cannot see."
         fix += ", if its errors are white"

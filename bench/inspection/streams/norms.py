@@ -7,19 +7,20 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ....datasets.described.description import Acceleration
 from ....datasets.log import Log
+from ....datasets.quantities import DEGREE
 from ....datasets.rig import Rig
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
 from ..findings.panels import AXIS_COLOURS, thinned
-from .channels import DEGREE
+from .channels import seconds
 from .neighbours import robust_sigma
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-G = 9.80665
-"""m/s²: standard gravity."""
+G = Acceleration.units["g"]
 MISREAD = {
     1 / G: ("g", "unit: g"),
     1e3 / G: ("mg", "unit: mg"),
@@ -82,7 +83,7 @@ def check_norms(log: Log) -> Check:
     findings += _rates(rate, tilting)
 
     def draw(axes: Axes) -> None:
-        t_s = (log.imu.t_ns - log.start_ns) * 1e-9
+        t_s = seconds(log, log.imu.t_ns)
         kept = thinned(norm)
         axes.plot(t_s[kept], norm[kept], lw=0.4, color=AXIS_COLOURS[0], label="|f|", rasterized=True)
         axes.axhline(rig.gravity, color="black", lw=1, label="gravity")
@@ -169,12 +170,16 @@ def levelled(R_BI: Array, up_B: Array) -> tuple[Array, bool]:
     square = bool(abs(up_B[axis]) > np.cos(SQUARE_DEG * DEGREE))
     if square:
         up_B = np.sign(up_B[axis]) * np.eye(3)[axis]
-    axis_B = np.cross(up_B, [0.0, 0.0, 1.0])
-    length = float(np.linalg.norm(axis_B))
-    if length < 1e-9:  # up or down already
-        axis_B, length = np.array([1.0, 0.0, 0.0]), 1.0
-    angle = np.arccos(np.clip(up_B[2], -1.0, 1.0))
-    return Rotation.from_rotvec(axis_B / length * angle).as_matrix() @ R_BI, square
+    return onto_z(up_B) @ R_BI, square
+
+
+def onto_z(up: Array) -> Array:
+    """Return the shortest rotation that takes `up` to z; half a turn about x where it points straight down."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, up[2])
+    axis = np.array([1.0, 0.0, 0.0]) if sine < 0.1 and up[2] < 0 else axis / max(sine, 1e-12)
+    return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def gyro_against_gravity(log: Log) -> Tilting:

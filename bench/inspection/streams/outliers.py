@@ -11,7 +11,7 @@ from ....datasets.log import Log
 from ....datasets.state import TimeArray
 from ..findings.finding import Check, Finding
 from ..findings.panels import AXIS_COLOURS, thinned
-from .channels import Channel, channels_of
+from .channels import Channel, channels_of, seconds
 from .missing import missing_rows, readings_of
 from .neighbours import FAR, outliers, residuals, robust_sigma, rounding_sigma
 
@@ -85,7 +85,7 @@ def _panel(log: Log, found: dict[str, Marked]) -> Callable[[Axes], None] | None:
             return None
 
     def draw(axes: Axes) -> None:
-        t_s = (channel.t_ns - log.start_ns) * 1e-9
+        t_s = seconds(log, channel.t_ns)
         for k, colour in zip(range(channel.x.shape[1]), AXIS_COLOURS, strict=False):
             kept, x = thinned(channel.x[:, k]), channel.x[:, k] * channel.shown
             axes.plot(t_s[kept], x[kept], lw=0.6, color=colour, label=channel.of_axis(k))
@@ -101,7 +101,7 @@ def _panel(log: Log, found: dict[str, Marked]) -> Callable[[Axes], None] | None:
             axes.set_ylim(min(low, far_low) - 0.2 * room, max(high, far_high) + 0.2 * room)
         if len(missing_ns):
             at = {"transform": axes.get_xaxis_transform(), "color": "black", "ms": 8}
-            axes.plot((missing_ns - log.start_ns) * 1e-9, np.full(len(missing_ns), 0.02), "|", label="no reading", **at)
+            axes.plot(seconds(log, missing_ns), np.full(len(missing_ns), 0.02), "|", label="no reading", **at)
         axes.set(xlabel="time, s", ylabel=f"{channel.name}, {channel.unit}")
         axes.legend(fontsize=6, ncols=2)
 

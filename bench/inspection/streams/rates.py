@@ -12,6 +12,7 @@ from ....datasets.state import Array, TimeArray
 from ...drawing import logarithmic
 from ..findings.finding import Check, Finding
 from ..findings.panels import colour_of, thinned
+from .channels import seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +54,7 @@ def check_rates(log: Log) -> Check:
         at = int(np.argmax(interval_s))
         facts[name] = (
             f"{len(t_ns)} at {1 / period_s:.4g} Hz, jitter {jitter:.1%}, lost {lost / (len(t_ns) + lost):.2%}, "
-            f"longest gap {interval_s[at]:.3g} s at {_since(log, int(t_ns[at])):.1f} s"
+            f"longest gap {interval_s[at]:.3g} s at {seconds(log, t_ns[at]):.1f} s"
         )
         mean_hz = (len(t_ns) - 1 + lost) / ((int(t_ns[-1]) - int(t_ns[0])) * 1e-9)
         bunched = _clusters(name, clustered, jitter, period_s, mean_hz)
@@ -72,7 +73,7 @@ def check_rates(log: Log) -> Check:
     def draw(axes: Axes) -> None:
         for order, (name, t_ns) in enumerate(times.items()):
             if len(t_ns) > 2:
-                t_s, interval_s = (t_ns[1:] - log.start_ns) * 1e-9, np.diff(t_ns) * 1e-9
+                t_s, interval_s = seconds(log, t_ns[1:]), np.diff(t_ns) * 1e-9
                 kept, look = (
                     thinned(interval_s),
                     {"ms": 1.5 + order, "zorder": 3 - order / 10, "color": colour_of(name)},
@@ -92,10 +93,6 @@ def _times(log: Log) -> dict[str, TimeArray]:
 def _longest_gap_s(name: str, period_s: float) -> float:
     """Return the length from which a gap is a silence rather than lost readings."""
     return max(LONGEST_IMU_GAP_S if name == "imu" else LONGEST_GAP_S, 3 * period_s)
-
-
-def _since(log: Log, t_ns: int) -> float:
-    return (t_ns - log.start_ns) * 1e-9
 
 
 def _lost(name: str, interval_s: Array, period_s: float) -> int:
@@ -153,7 +150,7 @@ def _gaps(log: Log, name: str, t_ns: TimeArray, lost: int) -> list[Finding]:
             Finding(
                 name,
                 f"{name} has {count} of more than {longest_s:g} s; the longest is {gap_s[at]:.3g} s, "
-                f"from {_since(log, int(edges_ns[at])):.1f} s after the start.",
+                f"from {seconds(log, edges_ns[at]):.1f} s after the start.",
             )
         )
     outside = len(t_ns) - len(inside)
@@ -196,7 +193,7 @@ def check_delays(log: Log) -> Check:
     def draw(axes: Axes) -> None:
         for name, late_s in late.items():
             if late_s.any():
-                t_s, kept = (log.streams[name].t_ns - log.start_ns) * 1e-9, thinned(late_s)
+                t_s, kept = seconds(log, log.streams[name].t_ns), thinned(late_s)
                 axes.plot(t_s[kept], late_s[kept], ".", ms=2, color=colour_of(name), label=name, rasterized=True)
         axes.set(xlabel="time, s", ylabel="received after it was true, s")
         axes.set_ylim(bottom=0)

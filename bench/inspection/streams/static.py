@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.log import Log
+from ....datasets.quantities import DEGREE
 from ....datasets.rig import EARTH_RATE_RAD_S
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
 from ..findings.panels import AXIS_COLOURS, thinned
-from .channels import DEGREE, channels_of
-from .neighbours import noise_sigma
+from .channels import channels_of, seconds
+from .neighbours import noise_sigma, stretches
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +72,7 @@ def rests(log: Log) -> list[Rest]:
     starts_ns, ends_ns = t_ns[0:n:size], t_ns[size - 1 : n : size]
     quiet &= _still_by_dvl(log, starts_ns, ends_ns)
     found, turns = [], []
-    for first, last in _runs(quiet):
+    for first, last in stretches(quiet):
         for a, b in _steady(first, last, means):
             long = (ends_ns[b] - starts_ns[a]) * 1e-9 >= SHORTEST_S - 2 * part_s
             if long and _stays(log, int(starts_ns[a]), int(ends_ns[b])):
@@ -118,11 +119,6 @@ def _stays(log: Log, start_ns: int, end_ns: int) -> bool:
     return True
 
 
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _steady(first: int, last: int, means: list[tuple[Array, float]]) -> list[tuple[int, int]]:
     """Cut a run of quiet windows where its means differ from those at its beginning: a steady turn is not rest."""
     cuts, begin = [], first
@@ -138,7 +134,7 @@ def check_static(log: Log) -> Check:
     found = rests(log)
 
     def draw(axes: Axes) -> None:
-        t_s = (log.imu.t_ns - log.start_ns) * 1e-9
+        t_s = seconds(log, log.imu.t_ns)
         for k, colour in enumerate(AXIS_COLOURS):
             w_deg = log.imu.w_WI_I[:, k] / DEGREE
             kept = thinned(w_deg)
@@ -161,7 +157,7 @@ def check_static(log: Log) -> Check:
     facts = {
         "stretches at rest": f"{len(found)}, {total_s:.0f} s in all, the longest "
         f"{(longest.last - longest.first) * log.imu.period_ns * 1e-9:.0f} s from "
-        f"{(int(log.imu.t_ns[longest.first]) - log.start_ns) * 1e-9:.0f} s",
+        f"{seconds(log, log.imu.t_ns[longest.first]):.0f} s",
         "gyro bias there": "({:.3g}, {:.3g}, {:.3g}) °/s".format(*bias / DEGREE),
         "|f| there": f"{size:.4f} m/s², gravity {log.rig.gravity:.4f}",
     }

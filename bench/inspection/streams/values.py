@@ -83,8 +83,8 @@ def _stuck(channel: Channel, x: Array, names: list[str]) -> tuple[list[Finding],
     for k, name in enumerate(names):
         if stuck[k]:
             message = f"{name} is {channel.text(float(x[0, k]))} in every row: it was not measured, or it is stuck."
-            sigma_key = {"dvl": "streams.dvl.sigma_m_s", "gps": "streams.gps.sigma_m"}.get(channel.stream)
-            fix = f"{path}.{channel.quantity}.columns" if sigma_key is None else f"{sigma_key}: .inf for that axis"
+            by_axis = channel.stream in ("dvl", "gps")
+            fix = f"{channel.sigma_key}: .inf for that axis" if by_axis else f"{path}.{channel.quantity}.columns"
             found.append(Finding(channel.stream, message, fix))
     return found, stuck
 
@@ -181,8 +181,7 @@ def _sigma_key(channel: Channel, sigma: float) -> str:
     """Return the key of log.yaml that states this sigma of one reading."""
     if channel.stream == "imu":
         return f"streams.imu.noise.{channel.name}_density: {sigma * np.sqrt(channel.period_s):.2g}"
-    key = {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(channel.stream, "sigma_m")
-    return f"streams.{channel.stream}.{key}: {sigma * channel.shown:.2g}"
+    return f"{channel.sigma_key}: {sigma * channel.shown:.2g}"
 
 
 def _clipped(channel: Channel, x: Array, names: list[str], steps: list[Quantisation]) -> list[Finding]:

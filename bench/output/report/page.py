@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,6 +14,7 @@ import pandas as pd
 
 from ...drawing import looks_of
 from ...errors import ExperimentError
+from ...files import write_whole, writing
 from ...results.store import load_runs
 from ...results.summary import Record, groups, records, summarise
 from .. import cells, sheets
@@ -63,14 +63,9 @@ def write_report(
     """
     text = render(rows, folder, differences)
     file = folder / "report.html" if file is None else file
-    unfinished = file.with_name(f"{file.name}.{os.getpid()}")
-    try:
+    with writing(file, "; choose another place by -o"):
         file.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(file)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise ExperimentError(f"{file}: cannot be written ({error.strerror}); choose another place by -o") from None
+        write_whole(file, text.encode())
     return file
 
 

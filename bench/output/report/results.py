@@ -10,6 +10,7 @@ import yaml
 from ....datasets.errors import nearest
 from ...errors import ExperimentError
 from ...experiment.plan import Experiment, plain, shipped_experiments
+from ...files import writing
 from ...results.summary import Record, records
 
 PLAN = "experiment.yaml"
@@ -41,10 +42,8 @@ def keep_plan(plan: Experiment, folder: Path) -> None:
         ExperimentError: it cannot be written.
     """
     text = yaml.safe_dump(plain(plan), sort_keys=False, allow_unicode=True, width=120)
-    try:
+    with writing(folder / PLAN):
         (folder / PLAN).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ExperimentError(f"{folder / PLAN}: cannot be written ({error.strerror})") from None
 
 
 def kept_plan(folder: Path, name: str) -> tuple[Experiment | None, str | None]:

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pandas as pd
 
+from ...metrics.bootstrap import FEWEST_SEEDS
 from ...results.intervals import TABLED, summarise_with_intervals
-from ...results.paired import FEWEST_SEEDS
 from ...results.step_time import machine_name
 from ...results.summary import UNFINISHED, Record, file_names, groups, records
 from ..cells import ACCURACY, NEES_NOTE, Column, digits, lag, scored_how, spans

@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from fathom.bench.metrics import ScoreError, pooled_rmse
+from fathom.bench.metrics.bootstrap import FEWEST_SEEDS
 from fathom.bench.metrics.comparison import Comparison
 from fathom.bench.output.tables.table import print_table
 from fathom.bench.results.paired import (
-    FEWEST_SEEDS,
     PAIRED,
     d_z,
     difference,
