@@ -236,6 +236,7 @@ def test_the_search_asks_for_training_runs_alone(tuning, monkeypatch) -> None:
     assert len(sea.asked) == 25 * 6
 
 
+@pytest.mark.slow
 def test_a_search_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, monkeypatch) -> None:
     whole = go(prepare(experiment(seeds=4), out=tmp_path / "whole"), monkeypatch, Sea(valley))
     for stop in (1, 19, 31):
@@ -247,6 +248,7 @@ def test_a_search_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path,
         assert len(first.asked) + len(second.asked) == 25 * 2  # what was finished is not run again
 
 
+@pytest.mark.slow
 def test_a_search_stopped_while_it_asks_for_a_batch_asks_for_the_rest_of_it(tmp_path, monkeypatch) -> None:
     whole = go(prepare(experiment(seeds=4), out=tmp_path / "whole"), monkeypatch, Sea(valley))
     tuning = prepare(experiment(seeds=4), out=tmp_path / "stopped")
@@ -256,6 +258,7 @@ def test_a_search_stopped_while_it_asks_for_a_batch_asks_for_the_rest_of_it(tmp_
     assert go(tuning, monkeypatch, Sea(valley)) == whole
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_search_and_another_seed_another(tmp_path, monkeypatch) -> None:
     first, second, third = (
         go(prepare(experiment(), out=tmp_path / str(k), seed=seed), monkeypatch, Sea(valley), 12)
