@@ -173,7 +173,7 @@ def linearise_tie(
 ) -> None:
     """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; eq. (4).
 
-    With x the prediction from x_i, the residual stands in the axes of B at j, as GTSAM's does (it matters only where
+    With x the prediction from x_i, the residual is in the axes of B at j, as GTSAM's does (it matters only where
     one of the two is kept while the other moves):
 
         e = Log(Rᵀ R_j)     R_jᵀ e_p = R_jᵀ (p_j − p)     R_jᵀ e_v = R_jᵀ (v_j − v)     b_j − b
