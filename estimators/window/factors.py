@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import DIM, THETA, Array
 from ..physics.blocks import clear
-from ..physics.compiled import compiled, inner
 from ..physics.elimination import add_scaled, decorrelate
 from ..physics.imu import predict, process_noise
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
