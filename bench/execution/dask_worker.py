@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import wait
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from .pool import Worker
@@ -45,6 +45,7 @@ class _SweepWorker:
     lock = threading.Lock()
     sweep: str = ""
     worker: Worker | None = None
+    dismissed: ClassVar[set[str]] = set()
 
 
 def greet(estimators: Sequence[str]) -> Greeting:
@@ -72,6 +73,8 @@ def do(sweep: str, task: bytes) -> Finished:
     from .pool import Worker
 
     with _SweepWorker.lock:  # one run at a time even with several threads, or timings would be wrong
+        if sweep in _SweepWorker.dismissed:
+            raise RuntimeError("the sweep has ended")  # nobody waits for the result
         if _SweepWorker.worker is None or _SweepWorker.sweep != sweep:
             _let_go()
             _SweepWorker.worker, _SweepWorker.sweep = Worker(), sweep
@@ -79,13 +82,14 @@ def do(sweep: str, task: bytes) -> Finished:
         worker.begin(_with_data_here(pickle.loads(task)))
         wait([worker.child.connection], max(0.0, worker.give_up_s - monotonic()))
         finished = worker.collect()
-        if worker.task is not None:  # it did not survive
+        if worker.task is not None or sweep in _SweepWorker.dismissed:  # it did not survive, or is needed no longer
             _let_go()
         return finished
 
 
 def dismiss(sweep: str) -> None:
-    """End the sweep's process, and the run in it."""
+    """End the sweep's process and the run in it; a run of the sweep that Dask hands over later does not begin."""
+    _SweepWorker.dismissed.add(sweep)
     worker = _SweepWorker.worker
     if worker is None or _SweepWorker.sweep != sweep:
         return
