@@ -70,7 +70,7 @@ UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 
 
 def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[str, str]) -> str:
-    steps, known = _followed(problem["loc"], model)
+    steps, known, inner = _followed(problem["loc"], model)
     place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in (*above, *steps)).lstrip(".")
     if problem["type"] in UNKNOWN_KEY:
         key = str(problem["loc"][-1])
@@ -81,12 +81,44 @@ def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[
         return f"missing key `{place}`"
     what = problem["msg"].removeprefix("Value error, ")
     if problem["type"] != "value_error":
-        what += f", found {repr(problem['input'])[:LONGEST_VALUE]}"
+        what = _expected(problem, inner) + f", found {repr(problem['input'])[:LONGEST_VALUE]}"
     return f"`{place}`: {what}" if place else what
 
 
-def _followed(loc: Sequence[str | int], model: Any) -> tuple[list[str | int], list[str]]:
-    """Return the steps of a place without pydantic's names for members of unions, and the keys known at its last."""
+NO_KEYS = ("dict_type", "mapping_type", "dataclass_type", "model_type", "model_attributes_type")
+"""Pydantic's types of error for a value that should have keys."""
+NAMING = ("log", "name")
+"""Keys whose value is a name: one of them was probably meant where a name stands instead of keys and values."""
+EXPECTED = {
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("list_type", "tuple_type", "set_type", "frozen_set_type", "iterable_type"), "a list"),
+    "string_type": "text",
+    "finite_number": "a finite number",
+    "none_required": "null",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+    "too_short": "a list of at least {min_length}",
+    "too_long": "a list of at most {max_length}",
+}
+"""What was expected, by pydantic's type of error; the braces are of its context."""
+
+
+def _expected(problem: Any, known: Sequence[str]) -> str:
+    """Return what was expected, in a file's words instead of Python's; `known` are the keys that the value may have."""
+    if problem["type"] in NO_KEYS:
+        key = next((key for key in NAMING if key in known), None)
+        keys = f" ({', '.join(known)})" if known else ""
+        hint = f"; write {{{key}: {problem['input']}}}" if key and isinstance(problem["input"], str) else ""
+        return f"expected keys and values{keys}{hint}"
+    if problem["type"] in EXPECTED:
+        return f"expected {EXPECTED[problem['type']].format(**problem.get('ctx', {}))}"
+    return str(problem["msg"]).replace("Input should be", "expected")
+
+
+def _followed(loc: Sequence[str | int], model: Any) -> tuple[list[str | int], list[str], list[str]]:
+    """Return the steps of a place without pydantic's names for members of unions, and the keys beside it and in it."""
     steps: list[str | int] = []
     kind, known = model, list(_keys(model))
     for step in loc:
@@ -101,7 +133,7 @@ def _followed(loc: Sequence[str | int], model: Any) -> tuple[list[str | int], li
             kind = next((arg for member in members for arg in get_args(_bare(member)) if arg is not Ellipsis), None)
         else:
             kind = next((_keys(part)[step] for part in parts if step in _keys(part)), None)
-    return steps, known
+    return steps, known, [key for member in _members(kind) for key in _keys(_bare(member))]
 
 
 def _members(kind: Any) -> Iterator[Any]:

@@ -62,7 +62,7 @@ class GraphSmoother(ABC):
             marginalised out. Tukey's loss and, less so, Cauchy's can have several minima: a reading beyond the width at
             the first guess, the IMU's prediction, has no weight until other readings move the estimate. So a vehicle
             whose error exceeds the width never uses that sensor again.
-        smoothed_covariance_s: smoothed states keep their covariance at this period.
+        smoothed_covariance_s: a smoothed state has its covariance once in this period; those between have none.
         earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
     """
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from enum import StrEnum
+from shutil import get_terminal_size
+from textwrap import fill
+from typing import Annotated
 
 import typer
 
@@ -16,10 +20,16 @@ class Listing(StrEnum):
     scores = "scores"
 
 
-def list_(what: Listing) -> None:
+def list_(what: Annotated[Listing, typer.Argument(metavar="LIST")]) -> None:
     """List estimators, logs, experiments or scores."""
     for name, about in LISTS[what]().items():
-        typer.echo(f"{name}: {about}" if about else name)
+        line = f"{name}: {about}" if about else name
+        typer.echo(folded(line, get_terminal_size().columns) if sys.stdout.isatty() else line)
+
+
+def folded(line: str, width: int) -> str:
+    """Fold a line between words to the width of a terminal, with the further lines indented."""
+    return fill(line, width, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
 
 
 def _estimators() -> dict[str, str]:

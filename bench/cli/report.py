@@ -9,7 +9,9 @@ import typer
 
 
 def report(
-    result: Annotated[str, typer.Argument(help="Folder of results, or name of an experiment under `results`.")],
+    result: Annotated[
+        str, typer.Argument(metavar="RESULT", help="Folder of results, or name of an experiment under `results`.")
+    ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="HTML file to write; default: RESULT/report.html.")
     ] = None,

@@ -11,12 +11,15 @@ from .verb import BAD_INPUT, INTERRUPTED, SOME_FAILED, say
 
 
 def reproduce(
-    result: Annotated[str, typer.Argument(help="Folder that `fathom run` wrote, or its name under `results`.")],
+    result: Annotated[
+        str, typer.Argument(metavar="RESULT", help="Folder that `fathom run` wrote, or its name under `results`.")
+    ],
     row: Annotated[
         str | None,
         typer.Argument(
+            metavar="ROW",
             help='Runs to repeat: "log/label", "log/label/seed", a pattern of these, or the first characters of an '
-            "identity; default: all."
+            "identity; default: all.",
         ),
     ] = None,
     data: Data = None,

@@ -41,8 +41,8 @@ class Pairs(StrEnum):
 
 
 def score(
-    truth: Annotated[Path, typer.Argument(help="Ground truth, TUM file: t x y z qx qy qz qw.")],
-    estimate: Annotated[Path, typer.Argument(help="Estimated trajectory, TUM file.")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH", help="Ground truth, TUM file: t x y z qx qy qz qw.")],
+    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="Estimated trajectory, TUM file.")],
     align: Annotated[Align, typer.Option(help="Alignment of the estimate with the truth.")] = Align.none,
     tolerance_s: Annotated[
         float, typer.Option(min=0, help="Largest difference in time between two poses that are compared, s.")
@@ -67,7 +67,7 @@ def score(
         rows += _score_rows("RPE", relative, f"{relative.n} pairs")
         settings += f"; RPE over {delta:g} {unit.value}, {pairs.value} pairs"
     except ScoreError as error:
-        settings += f"\nno RPE: {error}"
+        settings += f"\nno RPE: {str(error).removeprefix('rpe: ')}"
     _print_scores(rows)
     typer.echo(settings)
 

@@ -73,7 +73,7 @@ def against(
 
 @timing.command(cls=Verb)
 def profile(
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help='Estimators; "all" for every one of ours.')],
+    names: Annotated[list[str], typer.Argument(metavar="NAME", help='Estimators; "all" for every one of ours.')],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder for table and figures; default: results/profile.")
     ] = None,

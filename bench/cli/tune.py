@@ -34,15 +34,18 @@ def tune(
     ] = None,
     sensor: Annotated[
         list[str] | None,
-        typer.Option(help="Sensor whose noise is searched; repeatable; default: all, and gyro and accel."),
+        typer.Option(
+            metavar="NAME", help="Sensor (or gyro, accel) whose noise factor is searched; repeatable; default: all."
+        ),
     ] = None,
     trials: Annotated[
-        int, typer.Option(min=2, help="Number of sets of factors to try; the data sheet's is the first.")
+        int, typer.Option(min=2, help="Number of trials, each with one factor per sensor; in the first, all are 1.")
     ] = 60,
     score: Annotated[
         str,
         typer.Option(
-            help="Score from `fathom list scores`; NEES, NIS and coverage are brought to their expected value."
+            help="Score to minimise, from `fathom list scores`; of NEES, NIS and coverage, the distance from the "
+            "expected value."
         ),
     ] = "ate_rmse_m",
     output: Annotated[Output, typer.Option(help="Score the online or the smoothed trajectory.")] = Output.online,

@@ -17,6 +17,15 @@ SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 class Verb(TyperCommand):
     """A command that reports what a user can correct in one line. Bugs of ours keep their traceback."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the command line; an invalid choice is reported without pydantic's prefix."""
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if isinstance(message := getattr(error, "message", None), str):
+                error.message = message.removeprefix("Value error, ")  # type: ignore[attr-defined]
+            raise
+
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         try:

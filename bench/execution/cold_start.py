@@ -92,7 +92,7 @@ class Progress:
 
     def __init__(self, estimators: int) -> None:
         self._console = Console(stderr=True)
-        self._status = self._console.status("looking for compiled code")
+        self._status = self._console.status("checking what is compiled already")
         self._estimators, self._done, self._functions = estimators, 0, 0
         self._began_s = time.monotonic()
 

@@ -14,10 +14,21 @@ from __future__ import annotations
 
 from typing import Any
 
+PACKAGES = ("bench", "datasets", "estimators")
+
 
 def __getattr__(name: str) -> Any:
+    """Import a package on first use, so that `import fathom` is quick."""
     if name == "__version__":
-        from importlib.metadata import version
+        from importlib.metadata import version  # slow to import
 
         return version("fathom-bench")
+    if name in PACKAGES:
+        from importlib import import_module
+
+        return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *PACKAGES, "__version__"])

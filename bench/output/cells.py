@@ -206,7 +206,10 @@ def _reason(score: str, row: Record) -> str:
     if judges_covariance:
         judged = row["truth_kind"] == "truth" and row["align"] == "none"
         return "no valid covariance" if judged else "covariances are judged only against ground truth, unaligned"
-    return "not defined here"
+    lacking = {"heading": "heading", "rotation": "attitude", "velocity": "velocity"}.get(score.partition("_")[0])
+    if lacking and score in SCORES:
+        return f"no {lacking} in the {'ground truth' if row['truth_kind'] == 'truth' else row['truth_kind']}"
+    return "not defined for this run"
 
 
 # -- captions ---------------------------------------------------------------------------------------------------------
@@ -217,7 +220,7 @@ NEES_NOTE = "NEES: of position, per degree of freedom; 1 is consistent, more is 
 
 def against(truth_kind: str) -> str:
     """Return what errors are taken against."""
-    return "ground truth" if truth_kind == "truth" else f"a {truth_kind} (another filter's output)"
+    return "ground truth" if truth_kind == "truth" else f"a {truth_kind}, which is not ground truth"
 
 
 def scored_how(summary: Iterable[Record]) -> str:

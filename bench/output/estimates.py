@@ -11,7 +11,7 @@ import pandas as pd
 
 from ...datasets.state import Array
 from ...datasets.trajectory import Trajectory
-from ..metrics import Alignment, ScoreError, align, associate
+from ..metrics import Alignment, Dims, ScoreError, align, associate
 from ..results.summary import Record
 
 SMALLEST_EXTENT_M = 1.0
@@ -19,13 +19,18 @@ SMALLEST_EXTENT_M = 1.0
 
 
 class Track(NamedTuple):
-    """One run's estimate beside the truth, associated and aligned, or alone where there is no truth."""
+    """One run's estimate beside the truth, associated and aligned, or alone where there is no truth.
+
+    Attributes:
+        dims: "2d" where heights are not scored.
+    """
 
     label: str
     output: str
     align: Alignment
     truth: Trajectory | None
     estimate: Trajectory
+    dims: Dims = "3d"
 
 
 def tracks_of(rows: Sequence[Record], folder: Path) -> tuple[list[Track], int | None]:
@@ -45,7 +50,8 @@ def _track(row: Record, folder: Path) -> Track | None:
         return Track(row["label"], row["output"], "none", None, estimate)
     try:
         truth, estimate = associate(load_trajectory(folder / truth), estimate)
-        return Track(row["label"], row["output"], row["align"], truth, align(truth, estimate, row["align"]))
+        aligned = align(truth, estimate, row["align"])
+        return Track(row["label"], row["output"], row["align"], truth, aligned, row["dims"])
     except ScoreError:  # it has no score either
         return None
 
@@ -60,9 +66,12 @@ def load_trajectory(path: Path) -> Trajectory:
 
 
 def error_m(track: Track) -> Array:
-    """Return the position error (n, 3), m, of a track that has a truth."""
+    """Return the position error (n, 3), m, of a track that has a truth; NaN upwards where only 2d is scored."""
     assert track.truth is not None
-    return track.estimate.p_WB_W - track.truth.p_WB_W
+    error = track.estimate.p_WB_W - track.truth.p_WB_W
+    if track.dims == "2d":
+        error[:, 2] = np.nan
+    return error
 
 
 def is_near(track: Track) -> bool:

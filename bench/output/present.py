@@ -16,6 +16,7 @@ from ..files import writing
 from ..results.paired import paired
 from ..results.store import load_runs
 from ..results.summary import Record
+from .remarks import absence
 from .tables import terminal
 from .tables.latex import write_latex
 from .tables.table import (
@@ -43,6 +44,8 @@ def print_log(rows: pd.DataFrame, plan: Experiment) -> None:
 def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collection[str] = ()) -> None:
     """Print what `print_log` has not, then write tables, figures and report of all runs of this plan.
 
+    Where no log's recording is here, only that is printed, and no file is written.
+
     Args:
         outcome: of the sweep.
         plan: what was run.
@@ -53,6 +56,9 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
         ExperimentError: a file cannot be written.
     """
     rows = outcome.rows
+    if (rows["status"] == "absent").all():
+        print_remarks(rows, terminal.console())
+        return
     every = rows_of(load_runs(folder), plan.runs())
     others = every.loc[~every["identity"].isin(rows["identity"])]
     old = others.index[outdated(others, plan)]
@@ -78,15 +84,18 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     if len(old):
         say(f"{len(old)} rows of another spec or version are left out of the files; run without --only to renew them")
     for log, cause in outcome.kept.items():
-        say(f"{log}: {cause}; its rows are from an earlier run")
+        say(f"{absence(log, cause)}; its rows are from an earlier run")
 
 
 def _draw_figures(rows: pd.DataFrame, folder: Path, differences: list[Record]) -> int:
     """Draw all figures and return how many files they are; matplotlib takes a second to load, so it waits till here."""
-    with Console(stderr=True).status("drawing figures"):
+    with Console(stderr=True).status("drawing figures") as status:
         from .figures.figures import draw_figures
 
-        return len(draw_figures(rows, folder, differences))
+        def tell(done: int, total: int) -> None:
+            status.update(f"drawing figures: {done} of {total}")
+
+        return len(draw_figures(rows, folder, differences, tell))
 
 
 def _write_report(rows: pd.DataFrame, plan: Experiment, folder: Path, differences: list[Record]) -> None:

@@ -18,12 +18,17 @@ def failures(rows: Sequence[Record]) -> list[str]:
     lines = []
     for (log, label, seed), (row, *_) in groups(rows, "log", "label", "seed").items():
         if row["status"] == "absent":
-            lines.append(f"{log}: {row['cause']}")
+            lines.append(absence(log, row["cause"]))
         elif row["status"] != "done":
             of_seed = "" if seed is None else f" seed {seed}"
             when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
             lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {shorten(row['cause'], CAUSE_WIDTH)}")
     return list(dict.fromkeys(lines))
+
+
+def absence(log: str, cause: str) -> str:
+    """Return that a log's recording is not here and why, with its name once: a cause may begin with the name."""
+    return f"{log}: {cause.replace(f'not here: {log}: ', 'not here: ', 1)}"
 
 
 def mostly_outside(rows: Sequence[Record]) -> list[str]:

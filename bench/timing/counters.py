@@ -8,19 +8,21 @@ step that allocates.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from numba.core.runtime import _nrt_python as numba_memory  # pyright: ignore[reportAttributeAccessIssue]
-from rich import box
-from rich.table import Table
 
 from ...datasets import Scenario, simulate
 from ...datasets.epochs import Epoch, cut
 from ...estimators import Pass, create
 from ...estimators.stages import clock
 from ..execution.drive import score_ticks
-from ..output.tables.terminal import console
+from ..output.cells import ABSENT, Cell
+from ..output.sheets import Line, Sheet
+from ..output.tables import terminal
+from ..output.tables.table import print_sheet
 from .printing import progress, save, select
 
 COUNTED: dict[str, tuple[str, dict[str, Any]]] = {
@@ -33,7 +35,7 @@ COUNTED: dict[str, tuple[str, dict[str, Any]]] = {
     "window, lag 30 s": ("window", {"lag_s": 30.0}),
 }
 COUNTERS = {
-    "keyframes": "keyframes",
+    "keyframes": "keyframes made over the log",
     "factor_slots": "slots for factors in the smoother at the end, empty ones included",
     "relinearised": "variables (fls) or keyframes (window) that were linearised again, per keyframe",
     "refactored": "blocks that window factored, per keyframe",
@@ -115,12 +117,15 @@ def print_counters(only: str | None, out: Path | None) -> None:
         for k, name in enumerate(names):
             advance(name, k / len(names))
             found[name] = count(name)
-    table = Table("", *(key.replace("_", "\n") for key in COUNTERS), box=box.SIMPLE_HEAD)
-    for name, counters in found.items():
-        table.add_row(name, *(f"{counters[key]:,.4g}" if key in counters else "–" for key in COUNTERS))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    console().print(table)
-    for key, meaning in COUNTERS.items():
-        print(f"{key}: {meaning}")
+    print_sheet(counters_sheet(found), terminal.console())
     save(out, {"counters": found})
+
+
+def counters_sheet(found: Mapping[str, Mapping[str, float]]) -> Sheet:
+    """Return the table of what `count` found, by name; the meaning of each column stands below it."""
+    lines = [
+        Line(name, [Cell(f"{counters[key]:,.4g}" if key in counters else ABSENT) for key in COUNTERS])
+        for name, counters in found.items()
+    ]
+    meanings = [f"{key}: {meaning}" for key, meaning in COUNTERS.items()]
+    return Sheet("work in a step", meanings, ["estimator", *COUNTERS], lines)

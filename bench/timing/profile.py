@@ -8,15 +8,16 @@ from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from ...datasets import Log, Scenario, simulate
 from ...estimators.interface import Estimator
 from ...estimators.registry import ESTIMATORS, create, package_of
 from ..drawing import PALETTE, WIDTH_IN, empty_figure, looks_of, save
+from ..output.cells import ABSENT, Cell
+from ..output.sheets import Line, Sheet
 from ..output.tables import terminal
+from ..output.tables.table import print_sheet
 from ..results.store import provenance
 from .passes import PARTS, Timed, quickest, stopwatch
 from .printing import machine_text, made
@@ -117,24 +118,19 @@ def profile(
     return profiles
 
 
-def profile_table(profiles: Sequence[Profile]) -> Table:
+def profile_sheet(profiles: Sequence[Profile], title: str) -> Sheet:
     """Return the table of profiles for the terminal."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1))
-    table.add_column("estimator")
-    headings = ("µs per\nstep", "IMU\nsample", "key-\nframe", "propa-\ngation %", "linear-\nisation %", "solve\n%")
-    for heading in (*headings, "mar-\nginal %", "output\n%", "rest\n%", "finish\nms", "timing\nadds %"):
-        table.add_column(heading, justify="right")
+    headings = ["estimator", *(f"µs per\n{what}" for what in ("step", "IMU sample", "keyframe"))]
+    headings += [*(f"share, %\n{part}" for part in PARTS), "finish\nms", "timing adds\n%"]
+    lines = []
     for one in profiles:
         row = one.record()
         times = [row["us_per_step"], row["us_per_imu_sample"], row["us_per_keyframe"]]
-        table.add_row(
-            one.label,
-            *("–" if us is None else _us(float(us)) for us in times),
-            *(f"{100 * share:.1f}" for share in one.shares.values()),
-            f"{one.timed.finish_ns / 1e6:,.1f}",
-            f"{100 * one.overhead:.0f}",
-        )
-    return table
+        texts = [ABSENT if us is None else _us(float(us)) for us in times]
+        texts += [f"{100 * share:.1f}" for share in one.shares.values()]
+        texts += [f"{one.timed.finish_ns / 1e6:,.1f}", f"{100 * one.overhead:.0f}"]
+        lines.append(Line(one.label, [Cell(text) for text in texts]))
+    return Sheet(title, [], headings, lines)
 
 
 def _us(value: float) -> str:
@@ -194,7 +190,7 @@ def print_profile(names: Sequence[str], folder: Path | None) -> None:
     files += save(draw_over_log(courses, looks, f"{log.name}: steps against time in the log"), folder / "step-over-log")
 
     out = terminal.console()
-    out.print(profile_table(profiles))
+    print_sheet(profile_sheet(profiles, title), out)
     out.print(ABOUT)
     out.print(f"{title}; of each step the quickest of {REPEATS} repeats; µs with no stage timed, shares with all timed")
     out.print(machine_text(provenance()["machine"], provenance()["versions"]))

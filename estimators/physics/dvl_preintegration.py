@@ -1,6 +1,6 @@
 """Preintegrated DVL: the displacement between two keyframes, from DVL velocities turned by the gyro.
 
-    Δp̃_ij = Σ_k ΔR̃_ik v_b,k Δt                                                     [docs/conventions.md (5)]
+    Δp̃_ij = Σ_k ΔR̃_ik v_B,k Δt_k                                                   [docs/conventions.md (5)]
 
 in the axes of B at keyframe i. The rotation runs at IMU rate; the DVL's velocity is held from one reading to the next
 (or runs straight from one to the next), and over what is left, so that the sum ends exactly on keyframe j.

@@ -1,7 +1,7 @@
 """Gauss–Newton's normal equations on a chain of keyframes, each tied to its neighbours; docs/conventions.md (45).
 
-docs/window.md derives them; equation numbers are those of that page. They are block-tridiagonal, 15 × 15, and are
-eliminated in the covariance form, in which nothing cancels:
+docs/window.md derives them. They are block-tridiagonal, 15 × 15, and are eliminated in the covariance form, in which
+nothing cancels:
 
     δ_j = F δ_i + c + noise of covariance Q                                   a tie from keyframe i to the next, j
     N(m, P)              of δ_i, given all that is older and i's own rows
@@ -52,7 +52,10 @@ def absorb_joint_row(
     r: float, h_i: Array, h_j: Array, variance: float,
     m_i: Array, P_i: Array, m_j: Array, P_j: Array, P_ji: Array,
 ) -> bool:  # fmt: skip
-    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji = cov(δ_j, δ_i); eq. (5) for a row (3)."""
+    """Add the row r + h_i δ_i + h_j δ_j to the joint density of both, P_ji = cov(δ_j, δ_i).
+
+    See docs/window.md (5), for a row (3).
+    """
     PH = np.zeros((2, DIM))
     PH_i, PH_j = PH[0], PH[1]
     for k in range(DIM):
@@ -78,7 +81,7 @@ def absorb_joint_row(
 
 @compiled
 def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j: Array, P_ji: Array) -> None:
-    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P, P_j = F P Fᵀ + Q; eq. (6)."""
+    """Carry N(m, P) of δ_i over the tie: fill m_j = F m + c, P_ji = F P, P_j = F P Fᵀ + Q; docs/window.md (6)."""
     P_ij = np.empty((DIM, DIM))
     clear(P_ji)
     for a in range(DIM):
@@ -100,7 +103,7 @@ def cross_tie(F: Array, Q: Array, c: Array, m: Array, P: Array, m_j: Array, P_j:
 
 @compiled
 def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
-    """Fill the increments d of keyframes low to newest; eq. (8)."""
+    """Fill the increments d of keyframes low to newest; docs/window.md (8)."""
     mask, x = len(nodes) - 1, np.empty(DIM)
     last = nodes[newest & mask]
     for i in range(DIM):
@@ -123,7 +126,7 @@ def back_substitute(nodes: NDArray[Any], low: int, newest: int) -> None:
 
 @compiled
 def smooth_covariances(nodes: NDArray[Any], low: int, newest: int) -> None:
-    """Fill P_smoothed, the covariance of δ given everything, of keyframes newest down to low; eq. (9)."""
+    """Fill P_smoothed, the covariance of δ given everything, of keyframes newest down to low; docs/window.md (9)."""
     mask, gained = len(nodes) - 1, np.empty((DIM, DIM))
     copy_into(nodes[newest & mask].P[:], nodes[newest & mask].P_smoothed[:])
     for k in range(newest - 1, low - 1, -1):

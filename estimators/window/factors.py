@@ -171,7 +171,7 @@ def distance(factors: NDArray[Any], f: int, d_i: Array, d_j: Array) -> float:
 def linearise_tie(
     block: NDArray[Any], x_i: NDArray[Any], x_j: NDArray[Any], gravity: float, F: Array, Q: Array, c: Array
 ) -> None:
-    """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; eq. (4).
+    """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; docs/window.md (4).
 
     With x the prediction from x_i, the residual is in the axes of B at j, as GTSAM's does (it matters only where
     one of the two is kept while the other moves):
@@ -211,7 +211,12 @@ def linearise_tie(
 
 @compiled
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
-    """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor, STATE records; eq. (10)."""
+    """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor; docs/window.md (10).
+
+    Args:
+        anchor, x: STATE records.
+        mean, m, P: (15,), (15,), (15, 15).
+    """
     J, lacking = np.empty((3, 3)), np.empty(3)
     local(anchor, x, m)
     right_jacobian_into(m[THETA], J)

@@ -1,9 +1,9 @@
 """The steps of the window, compiled; `window_pass` calls them one after the other, as docs/window.md derives them.
 
     extend      close an interval, predict the next keyframe, and put the readings that go with it among the factors
-    linearise   what is new, and anew what has moved                                                   eq. (1) to (4)
-    solve       eliminate from the oldest keyframe that changed to the newest, and substitute back     eq. (5) to (8)
-    forget      drop the oldest keyframes; the prior of the next one is already computed                     eq. (10)
+    linearise   what is new, and anew what has moved                                    docs/window.md (1) to (4)
+    solve       eliminate from the oldest keyframe that changed to the newest, and substitute back            (5) to (8)
+    forget      drop the oldest keyframes; the prior of the next one is already computed                            (10)
 
 Numba optimises a function together with all that it calls, and again with each of its callers: so the tree of calls is
 flat, and a function takes the arrays that it needs, not all there are.

@@ -31,6 +31,10 @@ Plane = NDArray[np.complexfloating[Any, Any]]
 Values = TypeVar("Values", Array, Plane)
 
 
+SMALLEST_SIGMA = 1e-6
+"""Six decimals are shown at most, so a smaller sigma would be shown as zero."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A number, its standard deviation, and how many degrees of freedom that has."""
@@ -57,15 +61,20 @@ class Estimate:
         return Estimate(self.value * factor, self.sigma * abs(factor), self.dof)
 
     def text(self, unit: str = "") -> str:
-        """Return "value ± sigma unit", with two digits of sigma."""
+        """Return "value ± sigma unit", with two digits of sigma; below 1e-6 in powers of ten."""
         if not np.isfinite(self.sigma):
             return "not observable"
+        if 0 < self.sigma < SMALLEST_SIGMA:
+            return f"{self.value:.1e} ± {self.sigma:.1e}{' ' * bool(unit)}{unit}"
         digits = 3 if self.sigma <= 0 else int(np.clip(1 - np.floor(np.log10(self.sigma)), 0, 6))
-        return f"{self.value:.{digits}f} ± {self.sigma:.{digits}f}{' ' * bool(unit)}{unit}"
+        value = round(self.value, digits) + 0.0  # -0.0 becomes 0.0
+        return f"{value:.{digits}f} ± {self.sigma:.{digits}f}{' ' * bool(unit)}{unit}"
 
     def text_if(self, size: float, unit: str = "") -> str:
         """Return `text`, or "not observable here" if it is not known to `size`."""
-        return self.text(unit) if self.known_to(size) else f"not observable here (sigma {self.sigma:.2g} {unit})"
+        if self.known_to(size):
+            return self.text(unit)
+        return f"not observable here (sigma {self.sigma:.2g}{' ' * bool(unit)}{unit})"
 
 
 @dataclass(frozen=True, eq=False)

@@ -171,15 +171,15 @@ def gyro_against_heading(log: Log, imu: Inertial) -> PairCheck | None:
             )
     spread = _error_growth(log, imu, found) if turning and abs(found.slope.value - 1) < 0.3 else None
     if spread is not None:
-        facts["heading less gyro, rms by time apart"] = ", ".join(
+        facts["heading less integrated gyro: rms growth"] = ", ".join(
             f"{np.degrees(np.sqrt(max(v, 0))):.2g}° in {lag:.3g} s" for lag, v in spread.shown
         )
         findings += spread.findings(log, found)
     delays = (Delay("heading", "imu", found.delay),) if turning and found.delay.known_to(0.5) else ()
 
     def draw(axes: Axes) -> None:
-        axes.plot(found.t_s / 60, np.degrees(found.left), ".", markersize=2)
-        axes.set(xlabel="time (min)", ylabel="heading less gyro (°)", title="gyro against heading")
+        axes.plot(found.t_s, np.degrees(found.left), ".", markersize=2)
+        axes.set(xlabel="time (s)", ylabel="heading less gyro (°)", title="gyro against heading")
         level = 1.5 * np.quantile(np.abs(np.degrees(found.left)), 0.99) + 0.1
         axes.set_ylim(-level, level)
 
@@ -424,7 +424,7 @@ def heading_against_truth(log: Log) -> PairCheck | None:
     offset = Estimate(fit["offset"].value + middle, fit["offset"].sigma, fit.dof)
     facts = {
         f"heading less {whose}": offset.times(1 / DEGREE).text("°"),
-        "rms about that": f"{np.degrees(fit.rms):.2f} °",
+        "rms of the residual": f"{np.degrees(fit.rms):.2f} °",
         f"heading later than {whose} by": fit["delay"].text_if(0.5, "s"),
     }
     facts |= _deviation(true, fit.residual, block)
@@ -443,7 +443,9 @@ def heading_against_truth(log: Log) -> PairCheck | None:
 
     def draw(axes: Axes) -> None:
         axes.plot(np.degrees(true) % 360, np.degrees(error + middle), ".", markersize=2)
-        axes.set(xlabel=f"yaw by {whose} (°)", ylabel="heading less it (°)", title=f"heading against {whose}")
+        axes.set(
+            xlabel=f"yaw by {whose} (°)", ylabel=f"heading less yaw by {whose} (°)", title=f"heading against {whose}"
+        )
 
     return PairCheck(Check(f"heading against {whose}", facts, tuple(findings), draw), delays)
 

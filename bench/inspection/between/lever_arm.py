@@ -353,11 +353,9 @@ def imu_against_dvl(log: Log, imu: Inertial) -> PairCheck | None:
 
     def draw(axes: Axes) -> None:
         for i, axis in enumerate(("forward", "left", "up")):
-            axes.plot(found.t_s / 60, found.left[:, i], ".", markersize=2, label=f"{axis} at the start")
+            axes.plot(found.t_s, found.left[:, i], ".", markersize=2, label=f"{axis} at the start")
         axes.legend(fontsize=7)
-        axes.set(
-            xlabel="time (min)", ylabel="m/s", title="IMU's velocity less the DVL's, each window's trend taken off"
-        )
+        axes.set(xlabel="time (s)", ylabel="m/s", title="IMU's velocity less the DVL's, each window's trend taken off")
 
     delays = (Delay("dvl", "imu", found.delay),) if found.delay.known_to(0.5) else ()
     return PairCheck(Check("IMU against DVL", facts, tuple(findings), draw), delays)

@@ -121,9 +121,9 @@ def truth_against_itself(log: Log) -> PairCheck | None:
     def draw(axes: Axes) -> None:
         off = np.cumsum(said - moved, axis=0)
         for axis, name in enumerate(AXES):
-            axes.plot(t_s[1:] / 60, off[:, axis], label=name)
+            axes.plot(t_s[1:], off[:, axis], label=name)
         axes.legend(fontsize=7)
-        axes.set(xlabel="time (min)", ylabel="∫ velocity less position (m)", title=f"{whose} against itself")
+        axes.set(xlabel="time (s)", ylabel="∫ velocity less position (m)", title=f"{whose} against itself")
 
     return PairCheck(Check(f"{whose} against itself", facts, tuple(findings), draw), delays)
 
@@ -157,7 +157,7 @@ def gps_against_truth(log: Log, reference: Reference) -> PairCheck | None:
     if fit is None:
         return None
     facts = {f"GPS less {whose}, {name}": fit[name].text("m") for name in ("east", "north")}
-    facts["rms about that"] = f"{fit.rms:.2g} m per axis"
+    facts["rms of the residual"] = f"{fit.rms:.2g} m per axis"
     facts[f"GPS later than {whose} by"] = fit["delay"].text_if(1.0, "s")
     findings = []
     stated = float(np.median(sigma[flat, :2]))
@@ -198,7 +198,7 @@ def depth_against_truth(log: Log, reference: Reference) -> PairCheck | None:
     if fit is None:
         return None
     offset = fit["offset"]
-    facts = {f"depth sensor's height less the {whose}'s": offset.text("m"), "rms about that": f"{fit.rms:.2g} m"}
+    facts = {f"depth sensor's height less the {whose}'s": offset.text("m"), "rms of the residual": f"{fit.rms:.2g} m"}
     delays: tuple[Delay, ...] = ()
     findings = []
     if "scale" in columns:
@@ -222,10 +222,10 @@ def depth_against_truth(log: Log, reference: Reference) -> PairCheck | None:
         findings.append(Finding("truth" if fix.startswith("truth") else "depth", message, fix))
 
     def draw(axes: Axes) -> None:
-        axes.plot(t_s / 60, z, label="depth sensor")
-        axes.plot(t_s / 60, height, label=whose)
+        axes.plot(t_s, z, label="depth sensor")
+        axes.plot(t_s, height, label=whose)
         axes.legend(fontsize=7)
-        axes.set(xlabel="time (min)", ylabel="height (m)", title=f"depth against {whose}")
+        axes.set(xlabel="time (s)", ylabel="height (m)", title=f"depth against {whose}")
 
     return PairCheck(Check(f"depth against {whose}", facts, tuple(findings), draw), delays)
 
@@ -284,15 +284,15 @@ def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> PairChec
         for i, axis in enumerate("xyz")
     ]
     said = [e.text("m") if e is not None and e.known_to(0.5) else "not observable" for e in arm]
-    facts[f"DVL's place from the {whose}'s"] = "forward " + ", left ".join(said[:2]) + f", up {said[2]}"
+    facts[f"lever arm of the DVL from the {whose}'s point"] = "forward " + ", left ".join(said[:2]) + f", up {said[2]}"
     delays = (Delay("dvl", "truth velocity", delay),) if delay.known_to(0.5) else ()
 
     def draw(axes: Axes) -> None:
         for i, axis in enumerate(("forward", "left", "up")):
             if known[:, i].any():
-                axes.plot(t_s[known[:, i]] / 60, error[known[:, i], i], ".", markersize=2, label=axis)
+                axes.plot(t_s[known[:, i]], error[known[:, i], i], ".", markersize=2, label=axis)
         axes.legend(fontsize=7)
-        axes.set(xlabel="time (min)", ylabel="m/s", title=f"DVL less velocity of the {whose}")
+        axes.set(xlabel="time (s)", ylabel="m/s", title=f"DVL less velocity of the {whose}")
 
     return PairCheck(Check(f"DVL against the velocity of the {whose}", facts, tuple(findings), draw), delays)
 

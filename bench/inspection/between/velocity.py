@@ -31,7 +31,7 @@ def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> PairChec
     whose = where.whose
     moved = found.scale.known_to(0.3 * max(abs(found.scale.value), 0.1))
     facts = {"turned by": by, "scale that the DVL needs": found.scale.text_if(0.3)}
-    facts["rms left in a twelfth of the log"] = f"{found.rms_m:.2g} m per axis"
+    facts["rms residual of the path"] = f"{found.rms_m:.2g} m per axis, within a twelfth of the log"
     findings: list[Finding] = []
     if found.mirrored:
         message = (
@@ -61,10 +61,10 @@ def dvl_against_positions(log: Log, imu: Inertial, where: Positions) -> PairChec
 
     def draw(axes: Axes) -> None:
         left = found.p - found.x
-        axes.plot(found.t_s / 60, left.real, ".", markersize=2, label="east")
-        axes.plot(found.t_s / 60, left.imag, ".", markersize=2, label="north")
+        axes.plot(found.t_s, left.real, ".", markersize=2, label="east")
+        axes.plot(found.t_s, left.imag, ".", markersize=2, label="north")
         axes.legend(fontsize=7)
-        axes.set(xlabel="time (min)", ylabel=f"{whose} less DVL's path (m)", title=f"DVL against {whose}")
+        axes.set(xlabel="time (s)", ylabel=f"{whose} less DVL's path (m)", title=f"DVL against {whose}")
 
     kept = tuple(delay for delay in delays if delay.by.known_to(0.5))
     return PairCheck(Check(f"DVL against the positions of the {whose}", facts, tuple(findings), draw), kept)

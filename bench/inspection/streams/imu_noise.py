@@ -50,8 +50,8 @@ def check_imu_noise(log: Log) -> Check:
             densities = noise_sigma(channel) * np.sqrt(channel.period_s)
             bound = _bound(curve, channel.period_s)
             facts[channel.name] = (
-                f"{_listed(densities)} {UNIT[channel.name]} from sample to sample, at most {_listed(bound)} by the "
-                f"curve, in motion (no {SHORTEST_REST_S:g} s at rest); stated {stated:.3g}"
+                f"{_listed(densities)} {UNIT[channel.name]} from sample to sample, at most {_listed(bound)} by its "
+                f"Allan deviation, in motion (no {SHORTEST_REST_S:g} s at rest); stated {stated:.3g}"
             )
             findings += _under_way(channel, densities, bound, stated)
         curves[channel.name] = (curve, stated)
@@ -124,7 +124,7 @@ def _panel(curves: dict[str, tuple[AllanCurve, float]], where: str) -> Callable[
             axes.loglog(
                 curve.tau_s, stated / np.sqrt(curve.tau_s), ls=dash, lw=0.8, color="black", label=f"{name}, stated"
             )
-        axes.set(xlabel=f"τ, s ({where})", ylabel="Allan deviation, rad/s, m/s²")
+        axes.set(xlabel=f"τ (s), {where}", ylabel="Allan deviation (rad/s, m/s²)")
         axes.legend(fontsize=5, ncols=2)
 
     return draw

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ....datasets.log import Log
 from ....datasets.state import Array
+from ...drawing import logarithmic
 from ..findings.finding import Check, Finding
 from ..findings.panels import colour_of
 from .channels import Channel, channels_of, seconds
@@ -64,6 +65,7 @@ def check_noise(log: Log) -> Check:
         axes.set_xscale("log")
         low, high = axes.get_xlim()
         axes.set_xlim(min(low, 0.2), max(high, 5))
+        logarithmic(axes, "x")
         axes.set_yticks(range(len(names)), names)
         axes.invert_yaxis()
         axes.set_xlabel("scatter from reading to reading / stated sigma")

@@ -75,8 +75,8 @@ def check_norms(log: Log) -> Check:
     facts = {
         "|f|, median": f"{size:.4f} m/s² ({ratio:.4f} of the stated gravity, {rig.gravity:.4f})",
         "f in body axes, median": "({:.3f}, {:.3f}, {:.3f}) m/s²".format(*mean_f_B),
-        "|rate|, 99 %": f"{rate:.4g} rad/s ({rate / DEGREE:.3g} °/s)",
-        "tilting of f against the gyro": f"slope {tilting.slope:.3g}, correlation {tilting.correlation:.2f}",
+        "angular rate, 99th percentile": f"{rate:.4g} rad/s ({rate / DEGREE:.3g} °/s)",
+        "change of f's direction against the gyro": f"slope {tilting.slope:.3g}, correlation {tilting.correlation:.2f}",
     }
     findings = _misread(size, rig.gravity) or _strength(log, norm)
     findings += _upright(rig, np.median(f_I, axis=0), size)
@@ -90,7 +90,7 @@ def check_norms(log: Log) -> Check:
         low, high = np.quantile(norm, [0.001, 0.999])
         room = 0.2 * (high - low) + 1e-3
         axes.set_ylim(min(low, rig.gravity) - room, max(high, rig.gravity) + room)
-        axes.set(xlabel="time, s", ylabel="specific force, m/s²")
+        axes.set(xlabel="time (s)", ylabel="specific force (m/s²)")
         axes.legend(fontsize=6)
 
     return Check("gravity, units and axes of the IMU", facts, tuple(findings), draw)

@@ -102,7 +102,7 @@ def _panel(log: Log, found: dict[str, Marked]) -> Callable[[Axes], None] | None:
         if len(missing_ns):
             at = {"transform": axes.get_xaxis_transform(), "color": "black", "ms": 8}
             axes.plot(seconds(log, missing_ns), np.full(len(missing_ns), 0.02), "|", label="no reading", **at)
-        axes.set(xlabel="time, s", ylabel=f"{channel.name}, {channel.unit}")
+        axes.set(xlabel="time (s)", ylabel=f"{channel.name} ({channel.unit})")
         axes.legend(fontsize=6, ncols=2)
 
     return draw

@@ -79,7 +79,7 @@ def check_rates(log: Log) -> Check:
                     {"ms": 1.5 + order, "zorder": 3 - order / 10, "color": colour_of(name)},
                 )
                 axes.plot(t_s[kept], interval_s[kept], ".", label=name, rasterized=True, **look)
-        axes.set(xlabel="time, s", ylabel="interval, s")
+        axes.set(xlabel="time (s)", ylabel="interval (s)")
         logarithmic(axes, "y")
         axes.legend(fontsize=6, markerscale=1.5, ncols=3)
 
@@ -195,7 +195,7 @@ def check_delays(log: Log) -> Check:
             if late_s.any():
                 t_s, kept = seconds(log, log.streams[name].t_ns), thinned(late_s)
                 axes.plot(t_s[kept], late_s[kept], ".", ms=2, color=colour_of(name), label=name, rasterized=True)
-        axes.set(xlabel="time, s", ylabel="received after it was true, s")
+        axes.set(xlabel="time (s)", ylabel="received after it was true (s)")
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=6, markerscale=3)
 

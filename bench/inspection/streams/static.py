@@ -144,7 +144,7 @@ def check_static(log: Log) -> Check:
             axes.axvspan(t_s[rest.first], t_s[rest.last], color="0.8", zorder=0, label=label)
         low, high = np.quantile(log.imu.w_WI_I / DEGREE, [0.001, 0.999])
         axes.set_ylim(low - 0.3 * (high - low) - 1e-3, high + 0.3 * (high - low) + 1e-3)
-        axes.set(xlabel="time, s", ylabel="gyro, °/s")
+        axes.set(xlabel="time (s)", ylabel="gyro (°/s)")
         axes.legend(fontsize=6, ncols=2)
 
     if not found:

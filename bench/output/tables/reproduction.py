@@ -8,16 +8,16 @@ from statistics import median
 from textwrap import shorten
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from ...execution.reproduce import Again, Difference, Value, changed_facts
-from ..cells import ABSENT
+from ..cells import ABSENT, Cell
+from ..sheets import Line, Sheet
 from . import terminal
+from .table import print_sheet
 
 WIDEST = 44
-"""Letters of a value in a cell: two such and a name fit 120 columns."""
-HEADINGS = ("output", "runs", "verdict", "then", "now", "difference", "relative")
+"""Letters of a value in a cell: one such, a name and an output fit 80 columns, two fit 120."""
+HEADINGS = ("log / label", "runs", "verdict", "then", "now", "difference", "relative")
 
 ROUNDING = (
     "versions or kind of machine differ, so sums are rounded differently: expect relative differences of about 1e-10, "
@@ -36,7 +36,7 @@ def print_reproduction(every: Sequence[Again], console: Console | None = None) -
     run = [again for again in every if again.skipped is None]
     if run:
         _print_facts(run, console)
-        console.print(_verdicts(run, most=None if len(run) == 1 else 1))
+        print_sheet(_verdicts(run, most=None if len(run) == 1 else 1), console)
     for line in _sentences(every):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
@@ -45,21 +45,20 @@ def _print_facts(run: Sequence[Again], console: Console) -> None:
     """Print what has changed in code, versions and machine, and which differences to expect from that."""
     counts = Counter((fact.name, fact.then, fact.now) for again in run for fact in changed_facts(again.stored))
     if counts:
-        table = _empty("made with", ("then", "now", "runs"))
+        lines = []
         for (name, then, now), n in counts.items():
-            values = [_short_hash(each) if name in ("commit", "code") else str(each or ABSENT) for each in (then, now)]
-            table.add_row(name, *values, f"{n}/{len(run)}")
-        console.print(table)
-        console.print()
+            texts = [_short_hash(each) if name in ("commit", "code") else _text(each) for each in (then, now)]
+            lines.append(Line(name, [Cell(text) for text in (*texts, f"{n}/{len(run)}")]))
+        print_sheet(Sheet("", [], ("made with", "then", "now", "runs"), lines), console)
     names = {name for name, _, _ in counts} - {"commit"}
     sentence = CODE if "code" in names else ROUNDING if names else SAME
     console.print(sentence, highlight=False, markup=False, soft_wrap=True)
     console.print()
 
 
-def _verdicts(run: Sequence[Again], most: int | None) -> Table:
+def _verdicts(run: Sequence[Again], most: int | None) -> Sheet:
     """Return a row per log, label and output if all is identical, else one for each of the `most` worst scores."""
-    table = _empty("log / label", HEADINGS)
+    lines = []
     grouped: dict[tuple[str, str], list[Again]] = {}
     for again in sorted(run, key=lambda again: again.stored.group):
         for output in again.differences:
@@ -70,14 +69,18 @@ def _verdicts(run: Sequence[Again], most: int | None) -> Table:
             ((each, again) for again in of_group for each in again.differences[output]),
             key=lambda pair: -pair[0].relative,
         )
-        cells = [Text(group), output, f"{same}/{len(of_group)}"]
+        whose, runs = output, f"{same}/{len(of_group)}"
         if not worst:
-            table.add_row(*cells, Text("identical", "green"))
+            lines.append(_line(group, whose, [runs, "identical", "", "", "", ""]))
         for each, again in _listed(worst)[:most]:
             seed = "" if most is None or again.stored.first["seed"] is None else f" (seed {again.stored.first['seed']})"
-            table.add_row(*cells, Text(f"{each.name}{seed}", "red"), *_difference(each))
-            cells = ["", "", ""]
-    return table
+            lines.append(_line(group, whose, [runs, f"{each.name}{seed}", *_difference(each)]))
+            whose, runs = "", ""
+    return Sheet("", [], HEADINGS, lines, section="output")
+
+
+def _line(group: str, output: str, texts: Sequence[str]) -> Line:
+    return Line(group, [Cell(text) for text in texts], section=output)
 
 
 def _listed(worst: Sequence[tuple[Difference, Again]]) -> list[tuple[Difference, Again]]:
@@ -102,7 +105,7 @@ def _sentences(every: Sequence[Again]) -> list[str]:
     lines = [f"{_several(of)}: {sentence}" for sentence, of in names.items()]
     run = [again for again in every if again.skipped is None]
     ratios = [again.time_ratio for again in run if again.time_ratio is not None]
-    took = f"; computing took {median(ratios):.2f} times as long (median), which does not count" if ratios else ""
+    took = f"; computing took {median(ratios):.2f} times as long (median; not compared)" if ratios else ""
     same = sum(again.is_identical for again in run)
     lines.append(f"{same} of {len(run)} runs came out identical, bit for bit{took}")
     return lines
@@ -112,19 +115,12 @@ def _several(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
-def _empty(first: str, headings: Sequence[str]) -> Table:
-    table = terminal.plain_table(first)
-    for heading in headings:
-        table.add_column(heading, overflow="fold", justify="left" if heading in ("output", "verdict") else "right")
-    return table
-
-
 def _short_hash(value: Value) -> str:
     digest, *edited = str(value or ABSENT).split("-", 1)
     return "-".join([digest[:12], *edited])
 
 
 def _text(value: Value) -> str:
-    if value is None:
+    if value is None or value == "":
         return ABSENT
     return shorten(value, WIDEST, placeholder="…") if isinstance(value, str) else f"{value:.12g}"

@@ -48,12 +48,12 @@ def print_table(rows: pd.DataFrame, console: Console | None = None, differences:
 
 
 def print_logs(rows: pd.DataFrame, console: Console) -> None:
-    """Print the tables of each log.
+    """Print the tables of each log, but of none whose recording is not here.
 
     Accuracy and cost for every log; the floor where it was asked for; consistency where NIS was asked for, or seeds are
     enough for ANEES; late readings and outliers where there were any.
     """
-    for summary in groups(summarise(rows), "log").values():
+    for summary in groups(summarise(rows[rows["status"] != "absent"]), "log").values():
         found = [sheets.accuracy(summary), sheets.over_floor(summary)]
         found += [sheets.consistency(summary) if is_judged(summary) else None, sheets.late_or_out(summary)]
         for sheet in found:
@@ -129,11 +129,11 @@ def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
         top, below = heading.split("\n") if "\n" in heading else ("", heading)
         shown.append(f"{'' if top == above else top}\n{below}" if tall else below)
         above = top
-    table = terminal.plain_table(shown[0], sheet.title)
+    names = [line.name for line in sheet.lines]
+    table = terminal.plain_table(shown[0], names, sheet.title)
     for heading, (_, *texts) in zip(shown[1:], columns, strict=True):
         width = max(map(cell_len, (*heading.split("\n"), *texts)))
         table.add_column(heading, justify="right", no_wrap=True, min_width=width)
-    names = [line.name for line in sheet.lines]
     for name, before, *texts in zip(names, ["", *names], *(column[1:] for column in columns), strict=False):
         table.add_row(Text("" if name == before else name), *map(Text, texts))
     return table

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -10,7 +13,9 @@ from rich.text import Text
 WIDTH = 120
 """Columns of output to a file or a pipe: enough for the tables of README."""
 NAME_WIDTH = 14
-"""The names of estimators are not folded to less than this many letters: they would be hard to read."""
+"""The column of names has at least this many letters: narrower, names would be hard to read."""
+LONGEST_WORD = 32
+"""Words of a name with more letters are folded: beside a longer one, 80 columns leave no room for two numbers."""
 
 
 def console() -> Console:
@@ -19,8 +24,9 @@ def console() -> Console:
     return there if there.is_terminal else Console(width=WIDTH)
 
 
-def plain_table(names: str, title: str | None = None) -> Table:
-    """Return a table without frames that has one column yet: of names, which are folded where there is no room."""
+def plain_table(heading: str, names: Iterable[str], title: str | None = None) -> Table:
+    """Return a table without frames that has one column yet: of names, folded between words where there is no room."""
+    longest = max((cell_len(word) for name in names for word in name.split()), default=0)
     table = Table(
         title=None if title is None else Text(title, "table.title"),
         title_justify="left",
@@ -29,5 +35,5 @@ def plain_table(names: str, title: str | None = None) -> Table:
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    table.add_column(names, overflow="fold", min_width=NAME_WIDTH)
+    table.add_column(heading, overflow="fold", min_width=max(NAME_WIDTH, min(longest, LONGEST_WORD)))
     return table

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fathom.bench.cli.app import app
+from fathom.bench.cli.list_ import folded
 from fathom.datasets import Trajectory
 from typer.testing import CliRunner
 
@@ -72,14 +73,19 @@ def test_a_recording_that_is_not_here_is_reported_plainly(tmp_path: Path) -> Non
     file = write(tmp_path, logs=logs, estimators="[{name: dead-reckoning}]")
     code, out, _ = call("run", file, "--out", tmp_path, "--data", tmp_path, "--jobs", 1)
     assert code == 0
-    assert "ictineu_stpere_2004: not here: " in out.splitlines()[-1]
-    assert call("run", file, "--out", tmp_path, "--data", tmp_path, "--only", "ictineu*")[0] == 2
+    assert out.splitlines()[-1].startswith("ictineu_stpere_2004: not here: no folder")
+    code, out, _ = call("run", file, "--out", tmp_path, "--data", tmp_path, "--only", "ictineu*")
+    assert code == 2
 
 
 def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(tmp_path: Path) -> None:
     file = write(tmp_path, logs="[{log: ictineu_stpere_2004}]", estimators="[{name: dead-reckoning}]")
     run = ("run", file, "--out", tmp_path)
-    assert call(*run, "--data", tmp_path)[0] == 2
+    code, out, _ = call(*run, "--data", tmp_path)
+    assert code == 2
+    assert out.startswith("ictineu_stpere_2004: not here: no folder")
+    assert out.count("\n") == 1
+    assert not (tmp_path / "short" / "report.html").exists()
     with closing(sqlite3.connect(tmp_path / "short" / "runs.sqlite")) as store, store:
         store.execute("UPDATE runs SET status = 'done', ate_rmse_m = 1.5, n_scored = 9")
     code, out, err = call(*run, "--data", tmp_path)
@@ -203,8 +209,23 @@ def test_score_prints_errors_with_their_alignment(tmp_path: Path) -> None:
     code, out, _ = call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--align", "se3")
     assert "3.000000" not in out
     assert "alignment: se3" in out
-    assert "no RPE: rpe: no pair of poses is 1.0 m apart" in out  # they are 0.6 m apart
+    assert "no RPE: no pair of poses is 1.0 m apart" in out  # they are 0.6 m apart
     assert call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--unit", "feet")[0] == 2
+
+
+def test_a_choice_that_there_is_not_is_refused_without_pydantics_words() -> None:
+    code, _, err = call("score", "a", "b", "--align", "se4")
+    assert code == 2
+    assert "'se4' is not one of 'none', 'origin', 'yaw', 'se3'" in " ".join(err.split())
+    assert "Value error" not in err
+
+
+def test_a_list_is_folded_between_words() -> None:
+    line = "estimator: lag_s, smoothed_covariance_s, relinearize, keyframe-period, factors"
+    lines = folded(line, 30).splitlines()
+    assert " ".join(part.strip() for part in lines) == line
+    assert max(map(len, lines)) <= 30
+    assert all(part.startswith("    ") for part in lines[1:])
 
 
 def test_help_imports_nothing_heavy() -> None:

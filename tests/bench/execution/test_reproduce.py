@@ -4,6 +4,7 @@ import json
 import sqlite3
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from hashlib import sha256
 from math import nextafter
 from pathlib import Path
@@ -21,6 +22,7 @@ from fathom.bench.execution.task import Finished, Task
 from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.floor import floors
+from fathom.bench.output.tables.reproduction import print_reproduction
 from fathom.bench.results import machine
 from fathom.bench.results.select import choose
 from fathom.datasets.described.folder import write_folder
@@ -28,6 +30,7 @@ from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.estimators import create
 from fathom.estimators.registry import ESTIMATORS
+from rich.console import Console
 from typer.testing import CliRunner
 
 SHORT = {
@@ -364,3 +367,15 @@ def test_every_estimator_gives_the_same_bits_again(tmp_path: Path) -> None:
     every = reproduce_all(choose(tmp_path / "all"), jobs=1)[0]
     assert len(every) == len(estimators)
     assert not [again.stored.name for again in every if not again.is_identical]
+
+
+def test_nothing_is_cut_or_folded_inside_a_word_in_80_columns(result: Path) -> None:
+    alter(result, "ate_rmse_m = ate_rmse_m * 1.5, label = 'dead-reckoning-of-a-dive'", "label = 'dead-reckoning'")
+    every, _ = reproduce_all(choose(result, "*/3"))
+    console = Console(width=80, record=True)
+    print_reproduction([replace(again, time_ratio=1.5) for again in every], console)
+    text = console.export_text()
+    assert "dive/dead-reckoning-of-a-dive" in text
+    assert "…" not in text
+    assert "ate_rmse_m" in text
+    assert "(median; not compared)" in text

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -814,3 +815,21 @@ def test_help_answers() -> None:
     )
     assert shown.returncode == 0
     assert "log.yaml" in shown.stdout
+
+
+def test_panels_have_one_clock_and_no_tick_labels_on_top_of_each_other() -> None:
+    figure = draw_inspection(inspect_log(simulated()))
+    figure.canvas.draw()
+    labels = [axes.get_xlabel() for axes in figure.axes]
+    assert {label for label in labels if label.startswith("time")} == {"time (s)"}
+    (noise,) = (axes for axes in figure.axes if axes.get_title().startswith("noise of the aiding sensors"))
+    shown = sorted(
+        (
+            text.get_window_extent()
+            for text in noise.get_xticklabels(which="both")
+            if text.get_text() and 0 <= noise.transAxes.inverted().transform(text.get_window_extent().p0)[0] <= 1
+        ),
+        key=lambda box: box.x0,
+    )
+    assert len(shown) > 1
+    assert all(left.x1 < right.x0 for left, right in pairwise(shown))

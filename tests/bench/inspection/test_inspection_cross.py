@@ -393,3 +393,21 @@ def test_clocks_are_chained_to_the_imu_and_a_contradiction_is_seen() -> None:
     assert again.agrees
     assert again.late["dvl"].sigma < story.late["dvl"].sigma
     assert not fit_clocks([*chain, delay("dvl", "imu", 0.9)]).agrees
+
+
+@pytest.mark.parametrize(
+    ("estimate", "unit", "text"),
+    [
+        (Estimate(1.234, 0.056), "m", "1.234 ± 0.056 m"),
+        (Estimate(-0.004, 0.5), "", "0.00 ± 0.50"),
+        (Estimate(-3.21e-8, 1.23e-8), "rad/s", "-3.2e-08 ± 1.2e-08 rad/s"),
+        (Estimate(0.0, np.inf), "m", "not observable"),
+    ],
+)
+def test_an_estimate_is_shown_to_two_digits_of_its_sigma(estimate: Estimate, unit: str, text: str) -> None:
+    assert estimate.text(unit) == text
+
+
+def test_what_is_not_observable_has_a_sigma_with_or_without_a_unit() -> None:
+    assert Estimate(1.0, 0.15).text_if(0.3) == "not observable here (sigma 0.15)"
+    assert Estimate(1.0, 0.15).text_if(0.3, "s") == "not observable here (sigma 0.15 s)"

@@ -61,6 +61,7 @@ def test_an_output_is_named_by_name_and_lag(output: str, lookahead_s: float | No
 
 
 RUN = {"status": "done", "truth_kind": "truth", "align": "none", "ate_rmse_m": None, "nees_position": None, "x": None}
+RUN |= {"heading_rmse_deg": None, "rotation_rmse_deg": None}
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,9 @@ RUN = {"status": "done", "truth_kind": "truth", "align": "none", "ate_rmse_m": N
         ("nees_position", {}, "no valid covariance"),
         ("nees_position", {"truth_kind": "reference"}, "covariances are judged only against ground truth, unaligned"),
         ("nees_position", {"align": "yaw"}, "covariances are judged only against ground truth, unaligned"),
-        ("x", {}, "not defined here"),
+        ("heading_rmse_deg", {"truth_kind": "reference"}, "no heading in the reference"),
+        ("rotation_rmse_deg", {}, "no attitude in the ground truth"),
+        ("x", {}, "not defined for this run"),
     ],
 )
 def test_a_dash_has_its_reason(score: str, row: dict[str, object], why: str) -> None:
@@ -109,6 +112,19 @@ def test_no_number_is_cut_however_narrow_the_terminal_is(width: int) -> None:
     assert "…" not in printed
     assert printed.count("–: no ground truth") == 1
     assert (printed.count("title") > 1) == (width < 200)
+
+
+def test_a_name_is_not_folded_inside_a_word() -> None:
+    console = Console(width=50, record=True)
+    lines = [sheets.Line("survey/dead-reckoning", [cells.Cell("1234.5")] * 6)]
+    print_sheet(sheets.Sheet("", [], HEADINGS, lines), console)
+    text = console.export_text()
+    assert text.count("survey/dead-reckoning") == text.count("────\n") > 1
+
+
+def test_a_reference_is_not_said_to_be_more_than_it_is() -> None:
+    assert cells.against("truth") == "ground truth"
+    assert cells.against("reference") == "a reference, which is not ground truth"
 
 
 def test_outputs_of_unequal_lag_are_apart_and_the_least_lag_comes_first() -> None:

@@ -107,6 +107,20 @@ def test_the_errors_are_the_errors_and_the_band_is_three_sigma(rows: pd.DataFram
     assert not figure.axes[0].collections  # dead reckoning claims no covariance
 
 
+def test_where_heights_are_not_scored_there_is_no_panel_of_them(rows: pd.DataFrame, folder: Path) -> None:
+    tracks, _ = tracks_of(records(rows.assign(dims="2d")), folder / "trajectories")
+    figure = draw_errors(tracks, looks_of(LABELS), "t")
+    assert [axes.get_title() for axes in figure.axes[:2]] == ["east error (m)", "north error (m)"]
+    assert len(figure.axes) == 2 * 2
+
+
+def test_progress_counts_the_figures(rows: pd.DataFrame, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "trajectories").symlink_to(folder / "trajectories")
+    told: list[tuple[int, int]] = []
+    n = len(draw_figures(rows, tmp_path, tell=lambda done, total: told.append((done, total)))) // 2
+    assert told == [(k, n) for k in range(n)]
+
+
 def test_a_saved_trajectory_keeps_states_exactly_and_covariance_blocks(rows: pd.DataFrame, folder: Path) -> None:
     name = rows.set_index("label").loc["eskf", "trajectory"]
     trajectory = load_trajectory(folder / "trajectories" / str(name))

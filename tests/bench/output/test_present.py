@@ -70,6 +70,17 @@ def test_what_is_printed_already_is_not_printed_again_and_every_log_is_in_the_fi
     assert (folder / "figures" / "first-tracks.pdf").is_file()
 
 
+def test_where_no_recording_is_here_each_log_has_one_line_and_no_file_is_written(
+    plan: Experiment, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = load_runs(folder)
+    causes = "not here: " + rows["log"] + ": the folder of recordings is not set"
+    present(Outcome(rows.assign(status="absent", cause=causes), 0, 0, {}), plan, tmp_path)
+    lines = sorted(capsys.readouterr().out.splitlines())
+    assert lines == [f"{log}: not here: the folder of recordings is not set" for log in ("first", "second")]
+    assert not list(tmp_path.iterdir())
+
+
 def test_to_print_tables_neither_matplotlib_nor_plotly_is_loaded() -> None:
     code = (
         "import sys, fathom.bench.output.present; sys.exit(', '.join({'matplotlib', 'plotly'} & {*sys.modules}) or 0)"

@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
+from fathom.bench.output.tables.table import print_sheet
 from fathom.bench.results.identity import versions
-from fathom.bench.timing.counters import COUNTED, count
+from fathom.bench.timing.counters import COUNTED, COUNTERS, count, counters_sheet
+from rich.console import Console
 
 BASELINE = Path(__file__).parent / "counters.json"
 DECIDES = ("numpy", "numba", "gtsam")
@@ -34,3 +36,15 @@ def test_a_factor_that_is_called_more_often_is_noticed(monkeypatch: pytest.Monke
     zealous = count("fls, lag 3 s")
     assert zealous["callbacks"] > 2 * usual["callbacks"]
     assert zealous["relinearised"] > 2 * usual["relinearised"]
+
+
+def test_the_table_has_every_count_in_80_columns() -> None:
+    console = Console(width=80, record=True)
+    found = {name: dict.fromkeys(COUNTERS, 1234.5) for name in COUNTED}
+    print_sheet(counters_sheet(found), console)
+    text = console.export_text()
+    assert "…" not in text
+    table = text.partition("\nkeyframes:")[0]
+    assert all(key in table for key in COUNTERS)
+    assert all(name in table for name in COUNTED)
+    assert table.count("1,234") + table.count("1,235") == len(COUNTERS) * len(COUNTED)

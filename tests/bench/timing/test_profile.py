@@ -10,8 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from fathom.bench.output.tables.table import print_sheet
 from fathom.bench.timing.passes import PARTS, Timed, WatchedPass, parts_of, quickest, stopwatch, timed_run
-from fathom.bench.timing.profile import Profile, draw_profile, profile, profile_table
+from fathom.bench.timing.profile import Profile, draw_profile, profile, profile_sheet
 from fathom.bench.timing.scaling import Steps, by_lag, course, over_log
 from fathom.datasets import Log, Scenario, simulate
 from fathom.estimators import ESTIMATORS, create
@@ -126,6 +127,16 @@ def test_of_each_step_the_quickest_is_taken_with_its_own_parts() -> None:
     assert best.finish_ns == 90
 
 
+def test_the_table_has_every_number_in_80_columns() -> None:
+    console = Console(width=80, record=True)
+    one = Profile("window, lag 30 s", timed([1_234_567_000, 50_000], [1000, 2000]), 1_234_000_000)
+    print_sheet(profile_sheet([one], "survey"), console)
+    text = console.export_text()
+    assert "…" not in text
+    assert all(word in text for word in ("617,000", *PARTS, "IMU sample", "keyframe", "finish", "timing adds"))
+    assert max(map(len, text.splitlines())) <= 80
+
+
 @pytest.mark.slow
 def test_a_run_in_a_process_of_its_own_gives_the_same_result_as_here_and_which_steps_it_took(log: Log) -> None:
     from fathom.bench import run_log
@@ -203,7 +214,7 @@ def test_timing_the_stages_changes_no_estimate(profiles: list[Profile], log: Log
 @pytest.mark.slow
 def test_the_table_of_the_fleet_fits_a_page_and_every_estimator_has_a_bar(profiles: list[Profile]) -> None:
     console = Console(width=120, record=True)
-    console.print(profile_table(profiles))
+    print_sheet(profile_sheet(profiles, ""), console)
     text = console.export_text()
     assert "…" not in text
     for name in ESTIMATORS:
