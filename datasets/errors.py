@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -56,7 +57,7 @@ def complaints(
         error: raised by validating `model`.
         model: a pydantic model or dataclass.
         above: the path of the model in the file.
-        renamed: old names of keys, with their new names.
+        renamed: old names of keys, with their new names, relative to the place of the old one.
     """
     every = error.errors(include_url=False)
     # where no item of a list fits, pydantic also says that the list is empty
@@ -74,7 +75,7 @@ def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[
     place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in (*above, *steps)).lstrip(".")
     if problem["type"] in UNKNOWN_KEY:
         key = str(problem["loc"][-1])
-        if key in renamed and key not in known:
+        if re.split("[.,]", renamed.get(key, ""))[0] in known:  # a key that is new at this place
             return f"`{place}` is called `{renamed[key]}` now"
         return f"unknown key `{place}`{nearest(key, known)} (known: {', '.join(known)})"
     if problem["type"] in ("missing", "missing_argument"):

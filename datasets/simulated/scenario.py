@@ -164,7 +164,7 @@ class Scenario:
         try:
             return cls(**{str(key): value for key, value in values.items()})
         except ValidationError as error:
-            raise DatasetError(f"{source}: {complaints(error, cls, renamed=CALLED_NOW)[0]}") from None
+            raise DatasetError(f"{source}: {'; '.join(complaints(error, cls, renamed=CALLED_NOW))}") from None
 
     def to_dict(self) -> dict[str, Any]:
         """Inverse of `from_dict`: plain values, ready for YAML."""
