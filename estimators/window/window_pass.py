@@ -173,7 +173,8 @@ class WindowPass:
         a = k & mask
         x = self._points[a : a + 1].copy()
         retract(x, self._nodes[a]["d"], x)
-        imu = over_world(self._samples(a)[1], x[0]["R_WB"], x[0]["b_g"], self._rig)
+        begin, end = (int(self._nodes["imu_from"][j & mask] - self._w["imu_gone"][0]) for j in (k, k + 1))
+        imu = over_world(self._imu[begin:end], x[0]["R_WB"], x[0]["b_g"], self._rig)
         displacement = preintegrate_dvl(
             imu, int(self._nodes[a]["t_ns"]), readings["t_ns"].copy(), readings["z"][:, :3].copy(),
             self._rig["inflate"][0, DVL] * readings["sigma"], x[0]["b_g"], self._rig,

@@ -149,7 +149,7 @@ import importlib, pathlib
 from fathom.estimators.physics import called, calling
 path = pathlib.Path(called.__file__)
 source = path.read_text()
-path.write_text(source.replace("x + 1.0", "x + 9.0"))
+path.write_text(source.replace("x + 1.0", "x + 19.0"))
 importlib.reload(called)
 importlib.reload(calling)
 path.write_text(source)
@@ -162,7 +162,7 @@ def test_code_of_sources_that_were_reloaded_is_not_kept(tmp_path: Path, monkeypa
     copy_of_the_package(tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(sys.modules[__name__], "CALL", RELOADED)
-        assert run(tmp_path, NUMBA_CACHE_DIR=cache)[0] == 10.0
+        assert run(tmp_path, NUMBA_CACHE_DIR=cache)[0] == 20.0
     assert run(tmp_path, NUMBA_CACHE_DIR=cache)[:2] == (2.0, 0)
 
 

@@ -158,11 +158,11 @@ def test_a_store_of_another_version_is_refused_before_anything_runs(tmp_path: Pa
     assert len(ran) == 1
 
 
-def test_the_log_with_the_least_work_goes_first_and_its_rows_are_handed_over_when_its_last_run_has_ended(
+def test_a_short_first_log_goes_first_and_its_rows_are_handed_over_when_its_last_run_has_ended(
     tmp_path: Path, ran: list[str]
 ) -> None:
     logs = [
-        {"name": name, "scenario": {"duration_s": s}} for name, s in (("long", 400), ("middle", 200), ("short", 20))
+        {"name": name, "scenario": {"duration_s": s}} for name, s in (("short", 20), ("middle", 200), ("long", 400))
     ]
     told: list[tuple[int, pd.DataFrame]] = []
     outcome = sweep(
@@ -170,11 +170,11 @@ def test_the_log_with_the_least_work_goes_first_and_its_rows_are_handed_over_whe
     )
     assert [name.split(" ")[0] for name in ran] == ["short", "short", "long", "long", "middle", "middle"]
     assert [(done, set(rows["log"])) for done, rows in told] == [(2, {"short"}), (4, {"long"}), (6, {"middle"})]
-    in_order = [told[k][1] for k in (1, 2, 0)]
+    in_order = [told[k][1] for k in (0, 2, 1)]
     assert pd.concat(in_order)["identity"].tolist() == outcome.rows["identity"].tolist()
 
 
-def test_logs_of_like_work_run_the_longest_first(tmp_path: Path, ran: list[str]) -> None:
+def test_where_the_first_log_is_not_short_the_longest_run_first(tmp_path: Path, ran: list[str]) -> None:
     logs = [{"name": str(s), "scenario": {"duration_s": s}} for s in (30, 20, 40)]
     run_experiment(experiment(logs=logs), out=tmp_path)
     assert [name.split(" ")[0] for name in ran] == ["40", "30", "20"]

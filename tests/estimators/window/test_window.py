@@ -101,6 +101,20 @@ def test_at_a_lag_it_reaches_gtsams_optimum(dvl: str) -> None:
     assert_one(ours, run_log(log, create("fls-batch", dvl=[dvl])))
 
 
+@pytest.mark.parametrize("factor", ["preintegrated-loose", "preintegrated-tight"])
+@pytest.mark.parametrize(
+    "dvl",
+    [DvlSpec(delay_s=0.15), DvlSpec(disorder_s=0.2), DvlSpec(delay_s=0.6, disorder_s=0.2)],
+    ids=["late", "out of order", "both"],
+)
+def test_late_dvl_readings_are_summed_up_to_their_keyframe_and_no_further(dvl: DvlSpec, factor: str) -> None:
+    log = simulate(replace(SHORT, duration_s=30.0, dvl=dvl), seed=3)
+    ours, theirs = (run_log(log, create(name, dvl=[factor])).online for name in ("window", "fls"))
+    assert ours is not None
+    assert theirs is not None
+    np.testing.assert_allclose(ours.p_WB_W, theirs.p_WB_W, atol=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("to_the_last_digit")
 @pytest.mark.parametrize(
