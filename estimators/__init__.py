@@ -11,11 +11,7 @@ window/             the smoother on our own solver (docs/window.md)
 graph/              the smoothers on GTSAM, the only folder that imports gtsam
 """
 
-from .compiled_cache import use_compiled_folder
-
-use_compiled_folder()  # before anything is compiled or loaded
-
-from .interface import FACTORS, Diverged, Estimator, Pass  # noqa: E402
-from .registry import ESTIMATORS, create  # noqa: E402
+from .interface import FACTORS, Diverged, Estimator, Pass
+from .registry import ESTIMATORS, create
 
 __all__ = ["ESTIMATORS", "FACTORS", "Diverged", "Estimator", "Pass", "create"]

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.compiled import Records, compiled, inner
 from ..datasets.epochs import DVL, READING, SENSOR
 from ..datasets.state import TimeArray
 from .interface import unknown_kind
-from .physics.compiled import Records, compiled, inner
 from .smoothers import GraphSmoother
 
 LONGEST_SILENCE_S = 1.0

@@ -17,8 +17,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 
+from ..datasets.compiled import compiled
 from .interface import FACTORS, sensors_among
-from .physics.compiled import compiled
 
 Loss = Literal["huber", "cauchy", "tukey"]
 WIDTHS: dict[Loss, float] = {"huber": 1.345, "cauchy": 2.3849, "tukey": 4.6851}

@@ -29,8 +29,8 @@ from .pool import run_all
 from .task import Task
 
 FIRST_SHARE = 0.1
-"""A log whose runs are at most this share of the work goes first, so that its table is there early. It costs little:
-the longest of the other runs begin a tenth of the time later at most."""
+"""An experiment's first log goes first where its runs are at most this share of the work, so that its table is there
+early. It costs little: the longest of the other runs begin a tenth of the time later at most."""
 
 LINE_EVERY_S = 10.0
 """Where there is no terminal, a line of progress comes at most this often: some twenty in a log of `make bench`."""
@@ -133,8 +133,12 @@ def sweep(
 def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[Task]]:
     """Return the tasks in the order to run them, in batches; runs on one log are neighbours, so workers load it once.
 
-    The longest logs come first, so that no worker is left alone with one at the end. But the log with the least work is
+    The longest logs come first, so that no worker is left alone with one at the end. But the experiment's first log is
     a batch of its own ahead of them, where it has a small share of the work; only what it needs is compiled before it.
+
+    Args:
+        tasks: in the order of the experiment.
+        duration_s: length of each log, by its name.
     """
 
     def longest(task: Task) -> tuple[float, str, int, float]:
@@ -144,10 +148,10 @@ def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[T
     work_s: Counter[str] = Counter()
     for task in ordered:
         work_s[task.run.log.name] += duration_s[task.run.log.name]  # type: ignore[assignment]
-    least = min(work_s, key=lambda log: work_s[log], default="")
-    if len(work_s) < 2 or work_s[least] > FIRST_SHARE * work_s.total():
+    first = tasks[0].run.log.name if tasks else ""
+    if len(work_s) < 2 or work_s[first] > FIRST_SHARE * work_s.total():
         return [ordered] if ordered else []
-    return [[t for t in ordered if t.run.log.name == least], [t for t in ordered if t.run.log.name != least]]
+    return [[t for t in ordered if t.run.log.name == first], [t for t in ordered if t.run.log.name != first]]
 
 
 def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Task], int]:

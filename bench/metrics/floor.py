@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ...datasets.compiled import compiled
 from ...datasets.epochs import IMU_SAMPLE, READING, Epoch, cut
 from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario
@@ -45,7 +46,6 @@ from ...datasets.simulated.simulator import simulate
 from ...datasets.state import DIM, LIMIT_NS, VELOCITY, Array, TimeArray, rotation_vector
 from ...datasets.trajectory import Trajectory
 from ...estimators.interface import FACTORS
-from ...estimators.physics.compiled import compiled
 from ...estimators.physics.elimination import add_scaled, decorrelate, project
 from ...estimators.physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, process_noise, sandwich
 from ...estimators.physics.measurements import measure

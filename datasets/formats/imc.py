@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, ClassVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from ..compiled import compiled
 from ..errors import DatasetError, nearest, nearest_file
 from .recording import Messages, Recording, TopicInfo, Wanted, not_found
 
@@ -278,7 +278,7 @@ def crc_table() -> NDArray[np.uint16]:
 CRC_TABLE = crc_table()
 
 
-@numba.njit(cache=True)
+@compiled
 def _messages(data, final, in_gap, table):  # pragma: no cover  (compiled)
     """Find the whole messages of a chunk.
 

@@ -36,10 +36,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, POSITION, THETA, VELOCITY, Array, Belief
 from ..physics.blocks import identity, set_block, set_product
-from ..physics.compiled import compiled, inner
 from ..physics.elimination import absorb, add_scaled
 from ..physics.imu import integrate, predict, process_noise, sandwich, turns
 from ..physics.measurements import measure

@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
+from ...datasets.compiled import compiled
 from ...datasets.epochs import Epoch
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, THETA, Array, Belief
 from ...datasets.trajectory import Trajectory
 from ..interface import Diverged
-from ..physics.compiled import compiled
 from ..physics.elimination import divide_into
 from ..physics.imu import BLOCK, predict, process_noise, sandwich
 from ..physics.so3 import inverse_right_jacobian_into

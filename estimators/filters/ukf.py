@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from ...datasets.compiled import compiled
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Array, Belief
 from ..interface import Diverged
-from ..physics.compiled import compiled
 from ..physics.imu import integrate, predict, process_noise
 from ..physics.measurements import measure
 from ..physics.state import inject, local, retract

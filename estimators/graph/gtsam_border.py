@@ -17,11 +17,11 @@ import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged, unknown_kind
 from ..physics.blocks import TOP, identity, rows_times, set_block
-from ..physics.compiled import compiled, inner
 from ..physics.dvl_preintegration import given_rotation
 from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual

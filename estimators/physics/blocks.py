@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ...datasets.compiled import compiled
 from ...datasets.state import Array
-from .compiled import compiled
 
 TOP: Any = np.int64(0)
 """The first row; a plain 0 would be a type of its own, and the function compiled once more."""

@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled
 from ...datasets.state import Array, TimeArray
 from .blocks import clear, identity
-from .compiled import compiled
 from .imu import HELD_RATE, turn_by
 from .so3 import product_into, skew_into, transform_into
 from .state import POSITION_0, THETA_0

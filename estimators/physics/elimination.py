@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import DIM, Array
-from .compiled import compiled, inner
 
 NO_VARIANCE = 1e-14
 """Of a component's own variance: a remainder below this is explained by the other components, up to rounding."""

@@ -41,11 +41,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.epochs import IMU_SAMPLE
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Array
 from .blocks import clear, identity, set_block, set_product
-from .compiled import compiled, inner
 from .so3 import (
     cross_into,
     exp_into,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled
 from ...datasets.epochs import SENSOR
 from ...datasets.state import DIM, Array, Belief
-from .compiled import compiled
 from .elimination import normalised_square, project
 from .measurements import measure
 from .state import as_record

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled
 from ...datasets.state import DIM
-from .compiled import compiled
 from .elimination import absorb
 from .imu import integrate, predict, process_noise, sandwich
 from .measurements import measure

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
 from ...datasets.state import Array
 from .blocks import TOP, clear, set_block, set_product
-from .compiled import compiled, inner
 from .so3 import (
     between,
     exp,

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import Array
-from .compiled import compiled, inner
 
 SMALL = 1e-4
 """rad; below it, two terms of each series are exact to double precision."""

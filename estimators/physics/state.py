@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import (
     ACCEL_BIAS,
     DIM,
@@ -27,7 +28,6 @@ from ...datasets.state import (
     Belief,
     NavState,
 )
-from .compiled import compiled, inner
 from .so3 import between_into, exp_into, log_into, product_into, right_jacobian_into
 
 FIRST: list[Any] = [np.int64(part.start) for part in (THETA, POSITION, VELOCITY, ACCEL_BIAS, GYRO_BIAS)]

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import DIM, Array
 from ..physics.blocks import clear
-from ..physics.compiled import compiled, inner
 from ..physics.elimination import add_scaled
 from ..physics.state import symmetrise
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import DIM, THETA, Array
 from ..physics.blocks import clear
-from ..physics.compiled import compiled, inner
 from ..physics.elimination import add_scaled, decorrelate
 from ..physics.imu import predict, process_noise
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
@@ -173,7 +173,7 @@ def linearise_tie(
 ) -> None:
     """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; docs/window.md (4).
 
-    With x the prediction from x_i, the residual stands in the axes of B at j, as GTSAM's does (it matters only where
+    With x the prediction from x_i, the residual is in the axes of B at j, as GTSAM's does (it matters only where
     one of the two is kept while the other moves):
 
         e = Log(Rᵀ R_j)     R_jᵀ e_p = R_jᵀ (p_j − p)     R_jᵀ e_v = R_jᵀ (v_j − v)     b_j − b

@@ -16,9 +16,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.compiled import Records, compiled, inner
 from ...datasets.state import DIM
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME
-from ..physics.compiled import Records, compiled, inner
 from ..physics.elimination import absorb_row, divide_into
 from ..physics.imu import integrate, predict
 from ..physics.state import STATE, retract

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 import scipy.linalg
 from fathom.datasets import Belief, ImuNoise, Mounting, NavState, Rig
 from fathom.datasets.epochs import DEPTH, DVL, GPS, IMU_SAMPLE, Epoch
@@ -121,7 +122,7 @@ SMOOTHERS_RIG = Rig(
 """With this noise nothing is left of what GTSAM's IMU factor has and our block has not; see test_linear_smoothers."""
 LAG = 5
 """The window, in epochs; each makes one keyframe."""
-SEEDS = [0, 1]
+SEEDS = [0, pytest.param(1, marks=pytest.mark.slow)]
 
 
 def options(name: str, thorough: bool) -> dict[str, object]:

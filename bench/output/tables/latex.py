@@ -47,7 +47,7 @@ def latex(rows: pd.DataFrame) -> str:
 
 def _table(summary: Sequence[Record], rows: Sequence[Record], label: str) -> str:
     long = any(len(row["label"]) > LONG for row in summary)
-    heads = [("", "estimator"), ("", "lag"), ("runs", "done"), *map(_heading, ACCURACY)]
+    heads = [("", "estimator"), ("look-", "ahead"), ("runs", "done"), *map(_heading, ACCURACY)]
     lines = [
         r"\begin{table*}[tbp]",
         r"\centering",

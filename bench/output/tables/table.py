@@ -97,7 +97,7 @@ def _width(table: Table, console: Console) -> int:
 def _whose(sheet: sheets.Sheet) -> list[tuple[str, ...]]:
     """Return the columns that tell, with the names, what a line is about: heading and texts of each."""
     lines = sheet.lines
-    found = [("lag", *(line.lag for line in lines))] if any(line.lag for line in lines) else []
+    found = [("look-\nahead", *(line.lag for line in lines))] if any(line.lag for line in lines) else []
     return found + ([(sheet.section, *(line.section for line in lines))] if sheet.section else [])
 
 

@@ -148,6 +148,7 @@ def test_bad_input_is_one_line_and_exit_2_before_anything_runs(tmp_path: Path, a
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.slow
 def test_a_table_that_cannot_be_written_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")

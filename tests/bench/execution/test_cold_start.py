@@ -55,6 +55,7 @@ def test_what_differs_in_numbers_runs_on_the_same_code() -> None:
     assert "depth" in code_of(create("eskf"))
 
 
+@pytest.mark.slow
 def test_the_first_time_is_reported_once_and_the_second_time_nothing_is_done(
     folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

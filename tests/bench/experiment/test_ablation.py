@@ -330,6 +330,7 @@ def test_one_command_runs_compares_and_draws(folder: Path, differences: list[dic
     assert figures == {f"l_{log}-ablation.{suffix}" for log in ("heard", "out") for suffix in ("pdf", "png")}
 
 
+@pytest.mark.slow
 def test_bars_are_the_ratios_and_whiskers_their_intervals(differences: list[dict[str, Any]]) -> None:
     of_log = [row for row in differences if row["baseline_log"] == "l heard"]
     looks = looks_of(["eskf", "eskf no dvl", "eskf no gps"])
@@ -346,6 +347,7 @@ def test_bars_are_the_ratios_and_whiskers_their_intervals(differences: list[dict
     assert colours == set(PALETTE[:3])
 
 
+@pytest.mark.slow
 def test_what_the_test_does_not_tell_from_chance_is_in_brackets(differences: list[dict[str, Any]]) -> None:
     def changes(p: float) -> list[str]:
         figure = draw_ablation([row | {"p_holm": p} for row in differences[:2]], looks_of(["eskf"]), "l")
@@ -355,6 +357,7 @@ def test_what_the_test_does_not_tell_from_chance_is_in_brackets(differences: lis
     assert changes(0.2) == [f"({change})" for change in changes(0.01)]
 
 
+@pytest.mark.slow
 def test_the_figure_is_vectors_and_a_legible_png(differences: list[dict[str, Any]], tmp_path: Path) -> None:
     smoothed_rows = [row | {"output": "smoothed", "lookahead_s": 3.0} for row in differences[:4]]
     figure = draw_ablation(differences[:4] + smoothed_rows, looks_of(["eskf"]), "l")

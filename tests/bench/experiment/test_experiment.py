@@ -263,6 +263,7 @@ def test_a_worker_hung_in_one_call_is_killed(tmp_path: Path, mishap: None, monke
     assert rows.loc["dead-reckoning", "status"] == "done"
 
 
+@pytest.mark.slow
 def test_a_row_says_where_its_numbers_come_from_and_running_again_replaces_it(tmp_path: Path) -> None:
     first = run_experiment(experiment(), out=tmp_path, jobs=1)
     again = run_experiment(experiment(), out=tmp_path, jobs=1)
@@ -342,6 +343,7 @@ time.sleep(3600)
 """
 
 
+@pytest.mark.slow
 def test_a_worker_in_the_midst_of_a_run_ends_with_its_parent(tmp_path: Path, mishap: None) -> None:
     with subprocess.Popen([sys.executable, "-c", ORPHANED], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None

@@ -749,6 +749,7 @@ def test_numbers_that_nothing_measures_are_one_line_and_exit_2(what: str, factor
     assert ("nothing measures" in err) or ("no sensor's" in err)
 
 
+@pytest.mark.slow
 def test_any_name_can_stand_over_the_page(tmp_path: Path) -> None:
     folder = write_folder(dataclasses.replace(simulated(), name="潜水 $x_{ \a [red]"), tmp_path / "log")
     assert call(folder, "-o", tmp_path / "page.png")[0] == 0

@@ -208,7 +208,7 @@ PLANTED: dict[str, tuple[dict[str, Any], str, str, float]] = {
 }
 
 
-@pytest.mark.parametrize("what", some_fast(PLANTED, 5))
+@pytest.mark.parametrize("what", some_fast(PLANTED, 3))
 def test_a_planted_fault_is_found_with_its_size(what: str) -> None:
     dials, stream, where, true = PLANTED[what]
     checks = cross_checks(sail(**dials))
@@ -271,7 +271,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_folder(sail(), tmp_path_factory.mktemp("log") / "clean")
 
 
-@pytest.mark.parametrize("what", some_fast(WRONG, 5))
+@pytest.mark.parametrize("what", some_fast(WRONG, 3))
 def test_what_a_finding_proposes_makes_it_vanish(written: Path, tmp_path: Path, what: str) -> None:
     changes, path = WRONG[what]
     file = tmp_path / "log.yaml"

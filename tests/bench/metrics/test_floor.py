@@ -138,7 +138,9 @@ class Dense:
         return with_rate_noise(Belief(0, self.states[k], P), self.rig).P
 
 
-@pytest.mark.parametrize(("scenario", "delays_s"), [(SPARSE, PUNCTUAL_S), (LATE, DELAYS_S)])
+@pytest.mark.parametrize(
+    ("scenario", "delays_s"), [(SPARSE, PUNCTUAL_S), pytest.param(LATE, DELAYS_S, marks=pytest.mark.slow)]
+)
 def test_every_floor_is_the_inverse_of_the_whole_information_matrix(
     scenario: Scenario, delays_s: dict[str, float]
 ) -> None:

@@ -28,6 +28,7 @@ def test_no_step_does_more_or_less_than_the_baseline(name: str) -> None:
     assert count(name) == pytest.approx(baseline["counters"][name], rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_factor_that_is_called_more_often_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """iSAM2 with its thresholds at zero linearises everything anew in every step."""
     usual = json.loads(BASELINE.read_text(encoding="utf-8"))["counters"]["fls, lag 3 s"]

@@ -137,6 +137,7 @@ def test_the_table_has_every_number_in_80_columns() -> None:
     assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_a_run_in_a_process_of_its_own_gives_the_same_result_as_here_and_which_steps_it_took(log: Log) -> None:
     from fathom.bench import run_log
 
@@ -166,6 +167,7 @@ def test_growth_is_distinguished_from_flatness() -> None:
     assert value == pytest.approx(0.5 / 1.5, rel=0.03)  # of the mean, which is that of the middle
 
 
+@pytest.mark.slow
 def test_a_step_of_the_window_costs_the_same_late_in_a_log_as_early() -> None:
     long = simulate(Scenario(mission="lawnmower", duration_s=240.0, imu="tactical"), seed=1)
     found = over_log({"window": create("window", lag_s=3.0)}, long, repeats=3)
@@ -173,6 +175,7 @@ def test_a_step_of_the_window_costs_the_same_late_in_a_log_as_early() -> None:
     assert np.median(cost[-6:]) < 1.5 * np.median(cost[6:12])
 
 
+@pytest.mark.slow
 def test_the_window_costs_more_by_lag_and_a_filter_has_none(log: Log) -> None:
     found = by_lag({"eskf": create("eskf"), "window": create("window")}, log, (1.0, 20.0), repeats=3)
     assert list(found["eskf"]) == [None]

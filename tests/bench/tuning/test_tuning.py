@@ -65,7 +65,7 @@ def test_without_a_word_the_first_half_of_the_seeds_trains_and_recorded_logs_tak
 def test_the_experiment_may_name_the_training_runs_and_the_command_line_overrules_it(tmp_path: Path) -> None:
     plan = experiment(seeds=4, tune={"held_out": ["sim/4"]})
     assert [run.seed for run in prepare(plan, out=tmp_path).split.train] == [1, 2, 3]
-    split = prepare(plan, sides=SplitPatterns(train=("sim/[23]",)), out=tmp_path).split
+    split = prepare(plan, patterns=SplitPatterns(train=("sim/[23]",)), out=tmp_path).split
     assert [run.seed for run in split.train] == [2, 3]
     assert [run.seed for run in split.held_out] == [1, 4]
 
@@ -89,7 +89,7 @@ def test_no_log_is_on_both_sides_and_none_is_empty(
     tmp_path: Path, changes: dict[str, Any], sides: SplitPatterns, complaint: str
 ) -> None:
     with pytest.raises(ExperimentError, match=re.escape(complaint).replace("'held_uot';", "'held_uot'.*")):
-        prepare(experiment(**changes), sides=sides, out=tmp_path)
+        prepare(experiment(**changes), patterns=sides, out=tmp_path)
 
 
 def test_one_recording_under_two_names_is_not_held_out(tmp_path: Path) -> None:
@@ -97,7 +97,7 @@ def test_one_recording_under_two_names_is_not_held_out(tmp_path: Path) -> None:
     logs = [same | {"name": "x"}, {"log": str(tmp_path / "." / "b" / ".." / "a"), "name": "y"}]
     (tmp_path / "b").mkdir()
     with pytest.raises(ExperimentError, match="x trains and y is held out: the same recording"):
-        prepare(experiment(logs=logs), sides=SplitPatterns(("x",), ("y",)), out=tmp_path)
+        prepare(experiment(logs=logs), patterns=SplitPatterns(("x",), ("y",)), out=tmp_path)
 
 
 def test_what_cannot_be_tuned_is_refused_before_anything_runs(tmp_path: Path) -> None:
@@ -116,12 +116,12 @@ def test_what_cannot_be_tuned_is_refused_before_anything_runs(tmp_path: Path) ->
     write_folder(replace(blind, truth=None), tmp_path / "blind", "csv")
     logs, sides = [*recorded(tmp_path, "a"), {"log": str(tmp_path / "blind")}], SplitPatterns(("blind",), ("a",))
     with pytest.raises(ExperimentError, match="blind: no truth, so no ate_rmse_m; --score nis_dvl"):
-        prepare(experiment(logs=logs), sides=sides, out=tmp_path)
-    assert prepare(experiment(logs=logs), sides=sides, objective=Objective("nis_dvl"), out=tmp_path).dials
+        prepare(experiment(logs=logs), patterns=sides, out=tmp_path)
+    assert prepare(experiment(logs=logs), patterns=sides, objective=Objective("nis_dvl"), out=tmp_path).dials
     with pytest.raises(DatasetError, match="ictineu_stpere_2004: held out, but neither here nor in"):
         prepare(
             experiment(logs=[*recorded(tmp_path, "c"), {"log": "ictineu_stpere_2004"}]),
-            sides=SplitPatterns(("c",), ()),
+            patterns=SplitPatterns(("c",), ()),
             out=tmp_path,
             data=tmp_path,
         )
@@ -236,6 +236,7 @@ def test_the_search_asks_for_training_runs_alone(tuning, monkeypatch) -> None:
     assert len(sea.asked) == 25 * 6
 
 
+@pytest.mark.slow
 def test_a_search_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path, monkeypatch) -> None:
     whole = go(prepare(experiment(seeds=4), out=tmp_path / "whole"), monkeypatch, Sea(valley))
     for stop in (1, 19, 31):
@@ -247,6 +248,7 @@ def test_a_search_that_was_stopped_anywhere_ends_as_if_it_had_not_been(tmp_path,
         assert len(first.asked) + len(second.asked) == 25 * 2  # what was finished is not run again
 
 
+@pytest.mark.slow
 def test_a_search_stopped_while_it_asks_for_a_batch_asks_for_the_rest_of_it(tmp_path, monkeypatch) -> None:
     whole = go(prepare(experiment(seeds=4), out=tmp_path / "whole"), monkeypatch, Sea(valley))
     tuning = prepare(experiment(seeds=4), out=tmp_path / "stopped")
@@ -256,6 +258,7 @@ def test_a_search_stopped_while_it_asks_for_a_batch_asks_for_the_rest_of_it(tmp_
     assert go(tuning, monkeypatch, Sea(valley)) == whole
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_search_and_another_seed_another(tmp_path, monkeypatch) -> None:
     first, second, third = (
         go(prepare(experiment(), out=tmp_path / str(k), seed=seed), monkeypatch, Sea(valley), 12)

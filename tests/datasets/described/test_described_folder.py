@@ -647,6 +647,7 @@ def test_errors_of_the_rig_and_the_imu_name_the_log(folder):
     assert str(error.value).startswith(f"{folder}: imu: 1 samples")
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data(), repair=st.booleans())
 def test_a_damaged_description_gives_a_log_or_an_error(folder, data, repair):
@@ -658,6 +659,7 @@ def test_a_damaged_description_gives_a_log_or_an_error(folder, data, repair):
     log_or_error(folder, repair=repair)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data(), repair=st.booleans(), name=st.sampled_from(sorted(FILES)))
 def test_a_damaged_table_gives_a_log_or_an_error(folder, data, repair, name):
@@ -673,6 +675,7 @@ def test_a_damaged_table_gives_a_log_or_an_error(folder, data, repair, name):
     (folder / name).write_bytes(raw)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(at=st.integers(0, 3000), junk=st.binary(min_size=1, max_size=40))
 def test_a_damaged_parquet_file_gives_a_log_or_an_error(tmp_path_factory, at, junk):

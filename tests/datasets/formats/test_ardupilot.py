@@ -277,6 +277,7 @@ def opens_or_says_why(folder: Path) -> None:
     assert isinstance(log, Log)
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=100)
 @given(data=st.data())
 def test_a_damaged_log_gives_a_log_or_an_error(short, data, capsys):

@@ -393,6 +393,7 @@ def read_or_says_why(folder: Path, source: Table, columns: Any, times: Any) -> N
         assert len(t_ns) == len(timed) == len(read[column])
 
 
+@pytest.mark.slow
 @FUZZ
 @given(data=st.data(), encoding=st.sampled_from(["utf-8", "latin-1", "utf-16", "utf-8-sig"]))
 def test_a_damaged_text_is_read_alike_in_pieces_or_whole_or_refused(tmp_path, monkeypatch, data, encoding):

@@ -198,6 +198,7 @@ def test_a_device_clock_that_wraps_and_drifts_returns_to_the_hosts():
     np.testing.assert_allclose(onto_host(host, unwrapped), true_s, atol=5e-4)
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=80)
 @given(at=st.integers(0, 15_000), junk=st.binary(max_size=60), cut=st.integers(0, 200))
 def test_a_damaged_lsf_gives_a_log_or_an_error(folder, at, junk, cut):
@@ -206,6 +207,7 @@ def test_a_damaged_lsf_gives_a_log_or_an_error(folder, at, junk, cut):
     log_or_error(folder, repair=True)
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=40)
 @given(at=st.integers(0, 10_000), junk=st.binary(min_size=1, max_size=30), kind=st.sampled_from(["zip", "gz"]))
 def test_a_damaged_archive_gives_a_log_or_an_error(folder, at, junk, kind):

@@ -272,6 +272,7 @@ def fuzzed(small, tmp_path_factory):
     return {name: (folder, (folder / "log.mcap").read_bytes()) for name, folder in files.items()}
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32), which=st.sampled_from([*ENCODINGS, *(f"{e}-plain" for e in ENCODINGS)]))
 def test_a_damaged_file_gives_a_log_or_an_error(fuzzed, seed, which):

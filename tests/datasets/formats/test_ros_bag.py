@@ -387,6 +387,7 @@ def fuzzed(small, ros1, tmp_path_factory):
     return {name: (folder, folder / file, (folder / file).read_bytes()) for name, (folder, file) in bags.items()}
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32), which=st.sampled_from(["ros1", "ros1-bz2", "sqlite", "metadata"]))
 def test_a_damaged_bag_gives_a_log_or_an_error(fuzzed, seed, which):

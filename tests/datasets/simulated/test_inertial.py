@@ -102,7 +102,10 @@ TEN_MINUTES = {"duration_s": 600, "noise_scale": 0.0}
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("mission", MISSIONS)
+@pytest.mark.parametrize(
+    "mission",
+    [pytest.param(name, marks=[] if name in ("lawnmower", "yo-yo") else pytest.mark.slow) for name in MISSIONS],
+)
 def test_free_inertial_navigation_returns_within_5_mm_after_10_minutes(mission, seed):
     assert_returns(Scenario(mission=mission, **TEN_MINUTES), seed)
 

@@ -67,7 +67,10 @@ def truth_at(log: Log, t_ns: np.ndarray) -> np.ndarray:
 # -- what the others report
 
 
-@pytest.mark.parametrize("mission", MISSIONS)
+@pytest.mark.parametrize(
+    "mission",
+    [pytest.param(name, marks=[] if name in ("lawnmower", "yo-yo") else pytest.mark.slow) for name in MISSIONS],
+)
 def test_noise_free_readings_follow_from_the_truth(mission):
     log = simulate(Scenario(mission=mission, duration_s=300, noise_scale=0.0), 5)
     truth, rig = log.truth, log.rig
@@ -261,7 +264,7 @@ def test_times_are_exact_integers(start_ns):
 
 
 @pytest.mark.parametrize("mission", MISSIONS)
-@pytest.mark.parametrize("duration_s", [20.0, 33.3, 1200.0])
+@pytest.mark.parametrize("duration_s", [20.0, 33.3, pytest.param(1200.0, marks=pytest.mark.slow)])
 def test_every_duration_makes_a_log_that_can_be_cut(mission, duration_s):
     voyage = cut(simulate(Scenario(mission=mission, duration_s=duration_s), 9))
     assert voyage.failure is None

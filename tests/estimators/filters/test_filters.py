@@ -42,7 +42,7 @@ def difference(a: Belief, b: Belief) -> tuple[float, float]:
     [
         Scenario(duration_s=120.0),
         Scenario(mission="yo-yo", duration_s=120.0, imu="consumer"),
-        Scenario(duration_s=120.0, **DELAYED),
+        pytest.param(Scenario(duration_s=120.0, **DELAYED), marks=pytest.mark.slow),
     ],
     ids=["lawnmower", "yo-yo", "delayed"],
 )

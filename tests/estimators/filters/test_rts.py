@@ -27,7 +27,7 @@ def smoothed(prior: Belief, epochs: list[Epoch], rig: object) -> Trajectory:
     return run.finish()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_where_all_is_linear_it_is_least_squares(seed: int) -> None:
     prior, epochs = linear_toy(seed)
     exact, _ = least_squares(prior, epochs, TOY_RIG, LINEAR, 2)

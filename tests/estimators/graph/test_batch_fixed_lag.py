@@ -28,6 +28,7 @@ def gaps_in_sigma(a: Trajectory, b: Trajectory) -> np.ndarray:
     return np.abs(np.hstack([theta, *rest])) / np.sqrt(np.einsum("nii->ni", a.P))
 
 
+@pytest.mark.slow
 def test_batch_and_incremental_lags_agree_in_state_and_in_covariance() -> None:
     """All 15 components, online and smoothed, from the second tick on."""
     log = simulate(replace(TACTICAL, duration_s=30.0), seed=4)

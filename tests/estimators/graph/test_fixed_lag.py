@@ -47,7 +47,7 @@ def position_gap_in_sigma(a: Trajectory, b: Trajectory, after_s: float) -> np.nd
     return (np.abs(a.p_WB_W - b.p_WB_W) / sigma)[rows]
 
 
-@pytest.mark.parametrize("mission", ["lawnmower", "yo-yo"])
+@pytest.mark.parametrize("mission", ["lawnmower", pytest.param("yo-yo", marks=pytest.mark.slow)])
 def test_filter_and_smoother_agree_online(mission: str) -> None:
     """After the first minute: positions within a tenth of a sigma, every standard deviation within 2 %."""
     log = simulate(replace(TACTICAL, mission=mission), seed=4)

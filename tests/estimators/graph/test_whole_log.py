@@ -18,7 +18,7 @@ def gap_m(a: Trajectory, b: Trajectory) -> float:
     return float(np.linalg.norm(a.p_WB_W - b.p_WB_W, axis=1).max())
 
 
-@pytest.mark.parametrize("mission", ["lawnmower", "yo-yo"])
+@pytest.mark.parametrize("mission", ["lawnmower", pytest.param("yo-yo", marks=pytest.mark.slow)])
 def test_batch_and_rts_agree_in_state_and_in_covariance(mission: str) -> None:
     """A graph of factors solved by Levenberg–Marquardt, and a filter swept back: nothing shared but the physics."""
     small = {"depth_m": 5.0, "shallow_m": 1.0, "leg_m": 15.0, "turn_radius_m": 5.0, "surface_for_s": 20.0}

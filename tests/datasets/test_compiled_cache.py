@@ -7,10 +7,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from fathom.estimators import compiled_cache
-from fathom.estimators.compiled_cache import code_of, compiled_folder, key_of
+from fathom.datasets import compiled_cache
+from fathom.datasets.compiled import compiled
+from fathom.datasets.compiled_cache import code_of, compiled_folder, key_of
 
 ROOT = Path(__file__).resolve().parents[2]
 CALL = """
@@ -18,17 +20,17 @@ from fathom.estimators.physics.calling import caller
 print(caller(1.0), sum(caller.stats.cache_hits.values()), caller.stats.cache_path)
 """
 CALLED = """
-from numba import njit
+from fathom.datasets.compiled import compiled
 
-@njit(cache=True)
+@compiled
 def callee(x):
     return x + 1.0
 """
 CALLING = """
-from numba import njit
+from fathom.datasets.compiled import compiled
 from .called import callee
 
-@njit(cache=True)
+@compiled
 def caller(x):
     return callee(x)
 """
@@ -73,7 +75,7 @@ def test_a_second_clone_and_a_changed_comment_compile_nothing(tmp_path: Path) ->
     cache = str(tmp_path / "cache")
     copy_of_the_package(tmp_path / "first")
     called = copy_of_the_package(tmp_path / "second")
-    called.write_text(CALLED.replace("@njit", "# a comment\n@njit"))
+    called.write_text(CALLED.replace("@compiled", "# a comment\n@compiled"))
     assert run(tmp_path / "first", NUMBA_CACHE_DIR=cache)[1] == 0
     assert run(tmp_path / "second", NUMBA_CACHE_DIR=cache)[1] == 1
 
@@ -121,3 +123,58 @@ def test_the_oldest_states_of_the_sources_are_forgotten(tmp_path: Path, monkeypa
 
 def test_the_folder_is_the_users_not_the_checkouts() -> None:
     assert not compiled_folder().is_relative_to(ROOT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "damage"),
+    [("*.nbi", b""), ("*.nbi", b"short"), ("*.nbc", bytes(range(256)) * 8), ("sources/*", bytes(range(256)))],
+)
+def test_damaged_files_are_compiled_anew_and_mended(tmp_path: Path, kind: str, damage: bytes) -> None:
+    cache = tmp_path / "cache"
+    copy_of_the_package(tmp_path)
+    run(tmp_path, NUMBA_CACHE_DIR=str(cache))
+    run(tmp_path, NUMBA_CACHE_DIR=str(cache))
+    damaged = list(cache.rglob(kind))
+    assert damaged
+    for path in damaged:
+        path.write_bytes(damage)
+    assert run(tmp_path, NUMBA_CACHE_DIR=str(cache))[0] == 2.0
+    value, hits, _, said = run(tmp_path, NUMBA_CACHE_DIR=str(cache))
+    assert (value, hits, said) == (2.0, 1, "")
+
+
+RELOADED = """
+import importlib, pathlib
+from fathom.estimators.physics import called, calling
+path = pathlib.Path(called.__file__)
+source = path.read_text()
+path.write_text(source.replace("x + 1.0", "x + 9.0"))
+importlib.reload(called)
+importlib.reload(calling)
+path.write_text(source)
+print(calling.caller(1.0), 0, calling.caller.stats.cache_path)
+"""
+
+
+def test_code_of_sources_that_were_reloaded_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cache = str(tmp_path / "cache")
+    copy_of_the_package(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys.modules[__name__], "CALL", RELOADED)
+        assert run(tmp_path, NUMBA_CACHE_DIR=cache)[0] == 10.0
+    assert run(tmp_path, NUMBA_CACHE_DIR=cache)[:2] == (2.0, 0)
+
+
+def test_a_cache_that_cannot_be_written_costs_no_run(monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+
+    @compiled
+    def twice(x: float) -> float:
+        return 2.0 * x
+
+    assert twice(2.0) == 4.0
+    assert "cannot be kept (No space left on device)" in caplog.text

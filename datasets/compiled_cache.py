@@ -12,14 +12,17 @@ from __future__ import annotations
 
 import ast
 import atexit
+import logging
 import os
+import re
 import shutil
 import sys
 import tempfile
-import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from hashlib import sha256
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +32,18 @@ import numpy as np
 import platformdirs
 from numba.core import caching, config
 
+from .errors import one_line
+
 ROOT = Path(__file__).resolve().parents[1]
 KEPT = 20
 """How many states of the sources keep their compiled code, 10 to 30 MB each; the one used longest ago goes first."""
 
 
-class CompiledCacheWarning(UserWarning):
-    """Compiled code cannot be kept, so every process compiles for itself."""
-
-
 @cache
-def sources() -> tuple[Path, ...]:
-    """Return the files that compiled code is made from: the types of a log, and the estimators."""
-    return (*sorted((ROOT / "datasets").glob("*.py")), *sorted((ROOT / "estimators").rglob("*.py")))
+def read_sources() -> dict[Path, str]:
+    """Return the files that compiled code is made from, as they were first read: a log's types and the estimators."""
+    paths = [*sorted((ROOT / "datasets").glob("*.py")), *sorted((ROOT / "estimators").rglob("*.py"))]
+    return {path: path.read_text(encoding="utf-8") for path in paths}
 
 
 def code_of(source: str) -> str:
@@ -73,24 +75,29 @@ def key_of(texts: Iterable[tuple[str, str]], notes: Path) -> str:
     machine = [sys.version, numba.__version__, np.__version__, llvm.get_host_cpu_name(), *_flags()]
     known = notes / sha256(repr((content, machine)).encode()).hexdigest()[:32]
     try:
-        return known.read_text(encoding="ascii")
-    except OSError:
-        key = sha256(repr(([(name, code_of(text)) for name, text in content], machine)).encode()).hexdigest()[:16]
+        noted = known.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError):
+        noted = ""
+    if not re.fullmatch("[0-9a-f]{16}", noted):
+        noted = sha256(repr(([(name, code_of(text)) for name, text in content], machine)).encode()).hexdigest()[:16]
         part = known.with_name(f"{known.name}.{os.getpid()}")
-        part.write_text(key, encoding="ascii")
-        part.replace(known)
-        return key
+        with suppress(OSError):  # then the next process parses the sources again
+            part.write_text(noted, encoding="ascii")
+            part.replace(known)
+    return noted
 
 
 def _flags() -> list[str]:
     """Return numba's settings that decide the machine code."""
-    names = ("OPT", "DISABLE_JIT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "CPU_NAME", "CPU_FEATURES", "BOUNDSCHECK")
+    names = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "CPU_NAME", "CPU_FEATURES", "BOUNDSCHECK")
     return [f"{name}={getattr(config, name, None)}" for name in names]
 
 
 def base_folder() -> Path:
     """Return the folder of all compiled code: below NUMBA_CACHE_DIR where that is set, else in the user's cache."""
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_path("fathom")) / "fathom-compiled"
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    base = Path(named).expanduser().absolute() if named else platformdirs.user_cache_path("fathom")
+    return base / "fathom-compiled"
 
 
 @cache
@@ -99,32 +106,56 @@ def compiled_folder() -> Path:
 
     Child processes find a temporary folder by NUMBA_CACHE_DIR.
     """
-    texts = [(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")) for path in sources()]
+    texts = [(path.relative_to(ROOT).as_posix(), text) for path, text in read_sources().items()]
     try:
         return _made(base_folder(), texts)
     except OSError as error:
-        base = Path(tempfile.mkdtemp(prefix="fathom-compiled-"))
-        atexit.register(shutil.rmtree, base, ignore_errors=True)
-        warnings.warn(
+        base = temporary_folder()
+        _warn_once(
             f"{base_folder()}: cannot be written ({error.strerror}); compiled code goes to {base} until this process "
-            "ends; set NUMBA_CACHE_DIR to a folder that can be written",
-            CompiledCacheWarning,
-            stacklevel=2,
+            "ends; set NUMBA_CACHE_DIR to a folder that can be written"
         )
         os.environ["NUMBA_CACHE_DIR"] = str(base)
         return _made(base_folder(), texts)
 
 
+@cache
+def temporary_folder() -> Path:
+    """Return a folder that is removed when this process ends."""
+    base = Path(tempfile.mkdtemp(prefix="fathom-compiled-"))
+    atexit.register(shutil.rmtree, base, ignore_errors=True)
+    return base
+
+
+_reloaded: set[Path] = set()
+"""Sources that have changed since they were first read, in this process."""
+
+
+def folder_for(path: Path) -> Path:
+    """Return the folder for the code of functions in `path`.
+
+    Where any source has changed since it was first read (`importlib.reload`), no folder is the right one to share: then
+    it is a temporary one.
+    """
+    first = read_sources().get(path)
+    if first is not None and path.read_text(encoding="utf-8") != first:
+        _reloaded.add(path)
+    return temporary_folder() / f"reloaded-{next(_numbers)}" if _reloaded else compiled_folder()
+
+
+_numbers = count()
+
+
 def _made(base: Path, texts: list[tuple[str, str]]) -> Path:
     notes = base / "sources"
-    notes.mkdir(parents=True, exist_ok=True)
     folder = base / key_of(texts, notes)
-    is_new = not folder.is_dir()
-    folder.mkdir(exist_ok=True)
-    tempfile.TemporaryFile(dir=folder).close()
-    os.utime(folder)  # the order in which folders were used
-    if is_new:
+    if not folder.is_dir():
+        notes.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
         _forget_oldest(base, notes)
+    with suppress(OSError):  # a folder that can be read but not written serves what it has
+        os.utime(folder)  # the order in which folders were used
     return folder
 
 
@@ -141,33 +172,64 @@ def _forget_oldest(base: Path, notes: Path) -> None:
 
 
 class Locator(caching._CacheLocator):
-    """Tells numba the folder and the key of our functions' compiled code."""
+    """Tells numba the folder and the key of a function's compiled code."""
 
     def __init__(self, py_func: Any, py_file: str) -> None:
         self._py_file, self._path = py_file, Path(py_file).resolve()
         self._lineno = py_func.__code__.co_firstlineno
+        self._folder = folder_for(self._path)
 
     @classmethod
-    def from_function(cls, py_func: Any, py_file: str) -> Locator | None:
-        """See numba's `_CacheLocator`; functions of other packages are left to numba's own locators."""
-        path = Path(py_file).resolve()
-        ours = path.is_file() and any(path.is_relative_to(ROOT / name) for name in ("bench", "datasets", "estimators"))
-        return cls(py_func, py_file) if ours else None
+    def from_function(cls, py_func: Any, py_file: str) -> Locator:
+        """See numba's `_CacheLocator`."""
+        return cls(py_func, py_file)
 
     def get_cache_path(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """See numba's `_CacheLocator`."""
-        return str(compiled_folder() / self._path.relative_to(ROOT).parent.as_posix().replace("/", "."))
+        inside = self._path.parent.relative_to(ROOT) if self._path.is_relative_to(ROOT) else Path(self._path.stem)
+        return str(self._folder / ".".join(inside.parts))
 
     def get_source_stamp(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Return what else than the folder's name decides the code: of a function beside the estimators, its file."""
-        return "" if self._path in sources() else sha256(code_of(self._path.read_text("utf-8")).encode()).hexdigest()
+        if self._path in read_sources():
+            return ""
+        return sha256(code_of(self._path.read_text(encoding="utf-8")).encode()).hexdigest()
 
     def get_disambiguator(self) -> str:  # pyright: ignore[reportIncompatibleMethodOverride]
         """See numba's `_CacheLocator`; no line number, for that moves with every comment."""
         return "code"
 
 
-def use_compiled_folder() -> None:
-    """Have numba keep our functions' code in `compiled_folder`; to be called before anything is compiled or loaded."""
-    defaults = [kind.__name__ for kind in caching.CacheImpl._locator_classes]
-    config.CACHE_LOCATOR_CLASSES = ",".join([f"{__name__}.{Locator.__name__}", *defaults])  # pyright: ignore[reportAttributeAccessIssue]
+class _CodeCacheImpl(caching.CompileResultCacheImpl):
+    _locator_classes = [Locator]  # noqa: RUF012 - as numba has it
+
+
+class CodeCache(caching.FunctionCache):
+    """Numba's cache of one function's code, kept by `Locator`; a cache that fails costs time, never a run."""
+
+    _impl_class = _CodeCacheImpl
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the code for a signature, or None; files that cannot be read are forgotten, and compiled anew."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception as error:  # a damaged pickle raises many kinds
+            _warn_once(f"{self.cache_path}: compiled code cannot be read ({one_line(error)}); it is compiled anew")
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the code for a signature, where it can be kept."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            _warn_once(
+                f"{self.cache_path}: compiled code cannot be kept ({error.strerror}); every process compiles anew; set "
+                "NUMBA_CACHE_DIR to a folder that can be written"
+            )
+
+
+@cache
+def _warn_once(message: str) -> None:
+    logging.getLogger("fathom").warning(message)
