@@ -25,7 +25,12 @@ def inspect(
     data: Data = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Figure to write (.png, .pdf, .svg), or a folder; default: inspect-NAME.png."),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="FILE",
+            help="Figure to write (.png, .pdf, .svg), or a folder; default: inspect-NAME.png.",
+        ),
     ] = None,
 ) -> None:
     """Check a log before it is used.

@@ -13,7 +13,8 @@ def report(
         str, typer.Argument(metavar="RESULT", help="Folder of results, or name of an experiment under `results`.")
     ],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="HTML file to write; default: RESULT/report.html.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="FILE", help="HTML file to write; default: RESULT/report.html."),
     ] = None,
 ) -> None:
     """Write results as one HTML page.

@@ -45,9 +45,12 @@ def score(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help="Estimated trajectory, TUM file.")],
     align: Annotated[Align, typer.Option(help="Alignment of the estimate with the truth.")] = Align.none,
     tolerance_s: Annotated[
-        float, typer.Option(min=0, help="Largest difference in time between two poses that are compared, s.")
+        float,
+        typer.Option(
+            min=0, metavar="SECONDS", help="Largest difference in time between two poses that are compared, s."
+        ),
     ] = 0.01,
-    delta: Annotated[float, typer.Option(help="Step of the RPE, in --unit.")] = 1.0,
+    delta: Annotated[float, typer.Option(metavar="STEP", help="Step of the RPE, in --unit.")] = 1.0,
     unit: Annotated[Unit, typer.Option(help="Unit of the step.")] = Unit.m,
     pairs: Annotated[Pairs, typer.Option(help="Pairs of poses for the RPE.")] = Pairs.all,
 ) -> None:

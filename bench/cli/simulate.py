@@ -15,8 +15,10 @@ def simulate(
     scenario: Annotated[
         str, typer.Argument(metavar="SCENARIO", help="YAML file with the keys of a scenario, or the name of a mission.")
     ],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write; it must not hold a log already.")],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder to write; it must not hold a log already.")
+    ],
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of all random numbers.")] = 1,
 ) -> None:
     """Simulate a mission and write it as a log.
 

@@ -33,7 +33,9 @@ timing = typer.Typer(
     rich_markup_mode=None,
 )
 Only = Annotated[str | None, typer.Option(metavar="GLOB", help="Measure only what matches this pattern.")]
-File = Annotated[Path | None, typer.Option("-o", "--out", help="Also write the results to this JSON file.")]
+File = Annotated[
+    Path | None, typer.Option("-o", "--out", metavar="FILE", help="Also write the results to this JSON file.")
+]
 
 
 @timing.command(cls=Verb)
@@ -55,9 +57,15 @@ def against(
     revision: Annotated[str, typer.Argument(metavar="REV", help="Revision that git knows: HEAD~1, a tag, a branch.")],
     short: Annotated[bool, typer.Option("--short", help="Fewer benchmarks: a minute or two.")] = False,
     only: Only = None,
-    limit: Annotated[float, typer.Option(min=1.0, help="Largest ratio of times that is accepted.")] = 1.10,
-    pairs: Annotated[int, typer.Option(min=0, help="Pairs of processes; 0: five, or three with --short.")] = 0,
-    rounds: Annotated[int, typer.Option(min=0, help="Turns A B B A per pair; 0: four, or three with --short.")] = 0,
+    limit: Annotated[
+        float, typer.Option(min=1.0, metavar="RATIO", help="Largest ratio of times that is accepted.")
+    ] = 1.10,
+    pairs: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Pairs of processes; 0: five, or three with --short.")
+    ] = 0,
+    rounds: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Turns A B B A per pair; 0: four, or three with --short.")
+    ] = 0,
     out: File = None,
 ) -> None:
     """Compare speed with another revision.
@@ -75,7 +83,8 @@ def against(
 def profile(
     names: Annotated[list[str], typer.Argument(metavar="NAME", help='Estimators; "all" for every one of ours.')],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for table and figures; default: results/profile.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder for table and figures; default: results/profile."),
     ] = None,
 ) -> None:
     """Show where an estimator's time goes.
@@ -90,7 +99,8 @@ def profile(
 @timing.command(cls=Verb)
 def cost(
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for table and figure; default: results/cost.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder for table and figure; default: results/cost."),
     ] = None,
 ) -> None:
     """Make the table of costs in the README, and its figure."""

@@ -39,18 +39,24 @@ def tune(
         ),
     ] = None,
     trials: Annotated[
-        int, typer.Option(min=2, help="Number of trials, each with one factor per sensor; in the first, all are 1.")
+        int,
+        typer.Option(
+            min=2, metavar="N", help="Number of trials, each with one factor per sensor; in the first, all are 1."
+        ),
     ] = 60,
     score: Annotated[
         str,
         typer.Option(
+            metavar="NAME",
             help="Score to minimise, from `fathom list scores`; of NEES, NIS and coverage, the distance from the "
-            "expected value."
+            "expected value.",
         ),
     ] = "ate_rmse_m",
     output: Annotated[Output, typer.Option(help="Score the online or the smoothed trajectory.")] = Output.online,
-    span: Annotated[float, typer.Option(min=1.01, help="Factors are searched from 1/SPAN to SPAN.")] = 10.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search.")] = 0,
+    span: Annotated[
+        float, typer.Option(min=1.01, metavar="SPAN", help="Factors are searched from 1/SPAN to SPAN.")
+    ] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the search.")] = 0,
     data: Data = None,
     out: Results = Path("results"),
     jobs: Jobs = 0,

@@ -56,7 +56,7 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
         ExperimentError: a file cannot be written.
     """
     rows = outcome.rows
-    if (rows["status"] == "absent").all():
+    if set(rows["status"]) == {"absent"}:
         print_remarks(rows, terminal.console())
         return
     every = rows_of(load_runs(folder), plan.runs())

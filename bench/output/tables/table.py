@@ -53,7 +53,7 @@ def print_logs(rows: pd.DataFrame, console: Console) -> None:
     Accuracy and cost for every log; the floor where it was asked for; consistency where NIS was asked for, or seeds are
     enough for ANEES; late readings and outliers where there were any.
     """
-    for summary in groups(summarise(rows[rows["status"] != "absent"]), "log").values():
+    for summary in groups(summarise(rows.loc[rows["status"] != "absent"]), "log").values():
         found = [sheets.accuracy(summary), sheets.over_floor(summary)]
         found += [sheets.consistency(summary) if is_judged(summary) else None, sheets.late_or_out(summary)]
         for sheet in found:

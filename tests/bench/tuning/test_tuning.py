@@ -338,7 +338,7 @@ def test_a_smaller_gain_on_what_is_held_out_is_distinguished_from_none(tuning, m
         return valley(factors, log, seed) ** share
 
     (warning,) = end(tuning, monkeypatch, half).warnings
-    assert warning.startswith("training and held-out part: a gain of ")
+    assert warning.startswith("training and held-out runs differ: a gain of ")
 
 
 def test_the_best_at_an_end_of_the_range_is_reported(tuning, monkeypatch) -> None:
