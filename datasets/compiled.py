@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar
 
-from numba import njit
+from numba import njit as typed_njit
 
 from .compiled_cache import CodeCache
 
 Records: TypeAlias = Any
 """An array of records; NumPy's types know nothing of their fields."""
 
+njit: Any = typed_njit
+"""Its type knows fewer options than it has."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
