@@ -169,9 +169,9 @@ def print_profile(names: Sequence[str], folder: Path | None) -> None:
         EstimatorError: an estimator is not known, or did not reach the end.
         TimingError: the folder cannot be made.
     """
-    folder = made(folder or Path("results") / "profile")
-    chosen = list(ESTIMATORS) if EVERY in names else list(dict.fromkeys(names))
+    chosen = list(dict.fromkeys(each for name in names for each in (ESTIMATORS if name == EVERY else (name,))))
     estimators = {name: create(name) for name in chosen}
+    folder = made(folder or Path("results") / "profile")
     looks = looks_of(list(ESTIMATORS | estimators))
     console = Console(stderr=True)
     with console.status("") as status:
