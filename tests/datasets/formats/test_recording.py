@@ -148,7 +148,7 @@ def test_ours_win_over_a_package_of_the_same_name(installed):
         ({"format": ["imc"]}, r"log.yaml: `recording.format`: no format \['imc'\]"),
         ({"format": None}, r"log.yaml: missing key `recording.format`"),
         ({"file": None}, r"log.yaml: missing key `recording.file`"),
-        ({"file": 3}, r"log.yaml: `recording.file`: .*string.*found 3"),
+        ({"file": 3}, r"log.yaml: `recording.file`: expected text, found 3"),
         ({"fiel": "x"}, r"unknown key `recording.fiel`; did you mean 'file'\? \(known: format, file, scale\)"),
         ({"scale": "much"}, r"log.yaml: `recording.scale`: .*found 'much'"),
         ({"file": "b.lines"}, r"b.lines: no such file; did you mean 'a.lines'\?"),
