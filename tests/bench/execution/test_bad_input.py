@@ -24,6 +24,8 @@ from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, HeadingSpec, ImuSpec
 from fathom.estimators import ESTIMATORS, create
 
+pytestmark = pytest.mark.slow  # whole runs and searches: seconds each
+
 SECOND = 10**9
 FUSING = [name for name in ESTIMATORS if name != "dead-reckoning"]
 SENSORS = ["dvl", "depth", "gps", "heading"]

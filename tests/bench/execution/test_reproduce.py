@@ -33,6 +33,8 @@ from fathom.estimators.registry import ESTIMATORS
 from rich.console import Console
 from typer.testing import CliRunner
 
+pytestmark = pytest.mark.slow  # whole runs and searches: seconds each
+
 SHORT = {
     "name": "short",
     "logs": [{"name": "short dive", "scenario": {"mission": "yo-yo", "duration_s": 20}}],

@@ -24,6 +24,8 @@ from fathom.datasets.log import DvlStream, ImuStream
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+pytestmark = pytest.mark.slow  # whole runs and searches: seconds each
+
 MISSIONS = ("lawnmower", "yo-yo", "helix", "box", "transit")
 ICTINEU, LAUV = "ictineu_stpere_2004", "lauv_noptilus2_2015"
 

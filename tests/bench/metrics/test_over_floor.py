@@ -24,6 +24,8 @@ from fathom.datasets.simulated.simulator import simulate
 from fathom.estimators import create
 from rich.console import Console
 
+pytestmark = pytest.mark.slow  # whole runs and searches: seconds each
+
 SCENARIO = {"duration_s": 20}
 PLAN = {
     "name": "f",

@@ -28,6 +28,8 @@ from fathom.datasets.errors import DatasetError
 from fathom.estimators.registry import create
 from typer.testing import CliRunner
 
+pytestmark = pytest.mark.slow  # whole runs and searches: seconds each
+
 SHORT = {"scenario": {"duration_s": 20, "imu": "industrial"}, "name": "sim"}
 Law = Callable[[dict[str, float], str, int | None], float | None]
 
