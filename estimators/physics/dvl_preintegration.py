@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled
+from ...datasets.compiled import compiled, inner
 from ...datasets.state import Array, TimeArray
 from .blocks import clear, identity
 from .imu import HELD_RATE, turn_by
@@ -78,8 +78,8 @@ def preintegrate_dvl(
     capacity = len(imu) + n
     position, turn, q = np.empty((capacity, 3)), np.empty((capacity, 3, 3)), np.empty(capacity)  # piece by piece
     weight = np.zeros((n, 3, 3))  # Σ ΔR Δt by reading
-    vectors, matrices = np.zeros((4, 3)), np.zeros((6, 3, 3))
-    w_I, w, dp, u = vectors[0], vectors[1], vectors[2], vectors[3]
+    vectors, matrices = np.zeros((3, 3)), np.empty((2, 3, 3))
+    w_I, w, dp = vectors[0], vectors[1], vectors[2]
     R, R_mid = matrices[0], matrices[1]
     identity(R)
     k, piece, now_ns = 0, 0, start_ns
@@ -91,11 +91,7 @@ def preintegrate_dvl(
         while now_ns < sample.t_ns:
             while k + 1 < n and t_ns[k + 1] <= now_ns:
                 k += 1
-            until_ns = sample.t_ns
-            if k + 1 < n and t_ns[k + 1] < until_ns:
-                until_ns = t_ns[k + 1]
-            if t_ns[k] > now_ns and t_ns[k] < until_ns:
-                until_ns = t_ns[k]
+            until_ns = _end_of_piece(now_ns, sample.t_ns, t_ns, k)
             dt = (until_ns - now_ns) * 1e-9
             share, ahead = 0.0, k  # of the next reading
             if straight and k + 1 < n and now_ns >= t_ns[k]:
@@ -121,19 +117,59 @@ def preintegrate_dvl(
 
     out = np.empty(1, DISPLACEMENT)
     d = out[0]
-    turned, u_turned, N_pp, S = matrices[2], matrices[3], matrices[4], matrices[5]  # Σ dt ΔR and Σ dt [u]× ΔR
-    N, qu, q_sum = d.N[:], w, 0.0  # Σ q u and Σ q
-    for k in range(n):
+    for i in range(3):
+        d.dp[i], d.b_g[i] = dp[i], b_g[i]
+        for j in range(3):
+            d.dR[i, j] = R[i, j]
+    _spread(turn, position, q, piece, weight, sigma, R_BI, out)
+    return out
+
+
+@inner
+def _end_of_piece(now_ns: int, until_ns: int, t_ns: TimeArray, k: int) -> int:
+    """Return where the piece that begins at now_ns ends: at the end of the IMU sample, or at a DVL reading before it.
+
+    Reading k is the one in force at now_ns, or the first of all where that is still to come.
+    """
+    if k + 1 < len(t_ns) and t_ns[k + 1] < until_ns:
+        until_ns = t_ns[k + 1]
+    if t_ns[k] > now_ns and t_ns[k] < until_ns:
+        until_ns = t_ns[k]
+    return until_ns
+
+
+@inner
+def _spread(
+    turn: Array, position: Array, q: Array, pieces: int, weight: Array, sigma: Array, R_BI: Array, out: NDArray[Any]
+) -> None:
+    """Fill the bias Jacobians and the covariance N of a displacement whose dR and dp are there.
+
+    A rotation impulse φ (B_i axes) at time s turns all that comes later: it adds −[u]× φ to Δp, u = Δp(T) − Δp(s). So
+    gyro noise, isotropic and of variance q, has cov(Δp) = Σ q (u·u I − u uᵀ) and cov(φ, Δp) = Σ q [u]×.
+
+    Args:
+        turn: (pieces, 3, 3) ΔR Δt of each piece.
+        position: (pieces, 3) Δp in its middle.
+        q: (pieces,) variance of its gyro noise, rad².
+        pieces: how many there are.
+        weight: (n, 3, 3) Σ ΔR Δt by DVL reading.
+        sigma: (n, 3) of the readings.
+        R_BI: mounting of the IMU.
+        out: DISPLACEMENT record of length 1.
+    """
+    d, vectors, matrices = out[0], np.zeros((2, 3)), np.zeros((4, 3, 3))
+    N, u, qu = d.N[:], vectors[0], vectors[1]
+    turned, u_turned, N_pp, S = matrices[0], matrices[1], matrices[2], matrices[3]  # Σ dt ΔR and Σ dt [u]× ΔR
+    q_sum = 0.0
+    for k in range(len(weight)):
         for i in range(3):
             for j in range(3):
                 for m in range(3):
                     N_pp[i, j] += weight[k, i, m] * sigma[k, m] ** 2 * weight[k, j, m]
-    for i in range(3):
-        qu[i] = 0.0
-    for m in range(piece):
+    for m in range(pieces):
         uu = 0.0
         for i in range(3):
-            u[i] = dp[i] - position[m, i]
+            u[i] = d.dp[i] - position[m, i]
             qu[i] += q[m] * u[i]
             uu += u[i] * u[i]
         for i in range(3):
@@ -146,21 +182,19 @@ def preintegrate_dvl(
         q_sum += q[m]
 
     product_into(turned, R_BI, S)
-    clear(N)
     product_into(u_turned, R_BI, d.p_bg[:])
     for i in range(3):
-        d.dp[i], d.b_g[i] = dp[i], b_g[i]
         for j in range(3):
-            d.dR[i, j], d.R_bg[i, j] = R[i, j], 0.0
+            d.R_bg[i, j] = 0.0
             for m in range(3):
-                d.R_bg[i, j] -= R[m, i] * S[m, j]
+                d.R_bg[i, j] -= d.dR[m, i] * S[m, j]
+    clear(N)
     skew_into(qu, S)
     for i in range(3):
         N[THETA_0 + i, THETA_0 + i] = q_sum
         for j in range(3):
             N[THETA_0 + i, POSITION_0 + j], N[POSITION_0 + j, THETA_0 + i] = S[i, j], S[i, j]
             N[POSITION_0 + i, POSITION_0 + j] = N_pp[i, j]
-    return out
 
 
 @compiled
