@@ -347,6 +347,17 @@ def assert_the_same(a: Log, b: Log) -> None:
             np.testing.assert_array_equal(getattr(stream, field), getattr(b.streams[name], field), strict=True)
 
 
+def assert_half_is_read_and_reported(log: Log, folder: Path, file: str, says: str) -> None:
+    """Cut the file of a log in the middle: what is whole is read, and a note says that the rest is missing."""
+    data = (folder / file).read_bytes()
+    (folder / file).write_bytes(data[: len(data) // 2])
+    cut = open_log(folder)
+    n = len(cut.imu.t_ns)
+    assert 2000 < n < 4000
+    np.testing.assert_array_equal(cut.imu.f_I, log.imu.f_I[:n])
+    assert any(f"{file}: {says}" in note for note in cut.notes)
+
+
 def damaged(data: bytes, seed: int) -> bytes:
     """The same bytes, some of them flipped, overwritten, cut out, put in, or cut off."""
     rng, mutable = random.Random(seed), bytearray(data)
