@@ -13,11 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
-from .state import Array, Belief, NavState, TimeArray
+from .state import DIM, Array, Belief, NavState, TimeArray
 from .times import seconds_to_ns
 
 if TYPE_CHECKING:
     import pandas as pd
+
+COVARIANCE = {(i, j): f"P_{i}_{j}" for i in range(DIM) for j in range(i, DIM)}
+"""Columns of a table for the upper triangle of P, by row and column of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +93,7 @@ class Trajectory:
     @classmethod
     def from_beliefs(cls, beliefs: list[Belief], lookahead_s: float = 0.0) -> Trajectory:
         """Stack beliefs, in time order; P is None if no belief has a covariance."""
-        P = np.array([b.P for b in beliefs]).reshape(-1, 15, 15)
+        P = np.array([b.P for b in beliefs]).reshape(-1, DIM, DIM)
         return cls(
             np.array([b.t_ns for b in beliefs], dtype=np.int64),
             np.array([b.state.R_WB for b in beliefs]).reshape(-1, 3, 3),
@@ -158,7 +161,7 @@ class Trajectory:
             if values is not None:
                 columns |= {f"{name}_{axis}": values[:, i] for i, axis in enumerate("xyz")}
         if self.P is not None:
-            columns |= {f"P_{i}_{j}": self.P[:, i, j] for i in range(15) for j in range(i, 15)}
+            columns |= {name: self.P[:, i, j] for (i, j), name in COVARIANCE.items()}
         return columns
 
     def to_pandas(self) -> pd.DataFrame:
@@ -189,11 +192,10 @@ class Trajectory:
             row = int(np.flatnonzero(~timed)[0])
             raise DatasetError(f"trajectory: row {row}: t_ns is {table['t_ns'].iloc[row]}, not a time")
         P = None
-        if "P_0_0" in table:
-            P = np.empty((len(table), 15, 15))
-            for i in range(15):
-                for j in range(i, 15):
-                    P[:, i, j] = P[:, j, i] = table[f"P_{i}_{j}"].to_numpy(float)
+        if COVARIANCE[0, 0] in table:
+            P = np.empty((len(table), DIM, DIM))
+            for (i, j), name in COVARIANCE.items():
+                P[:, i, j] = P[:, j, i] = table[name].to_numpy(float)
         return cls(
             t_ns, table[rotation].to_numpy(float).reshape(-1, 3, 3), table[position].to_numpy(float),
             vectors("v_WB_W"), vectors("b_a"), vectors("b_g"), P, lookahead_s,

@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from ..datasets.epochs import ATTITUDE, DEPTH, DVL, HEADING, SENSOR, Epoch
 from ..datasets.rig import Rig
-from ..datasets.state import Array, Belief, NavState
+from ..datasets.state import DIM, Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
 from .interface import FACTORS, Factors, unknown_kind
 from .physics.dvl_preintegration import preintegrate_dvl
@@ -67,7 +67,7 @@ class DeadReckoningPass:
     def belief(self) -> Belief:
         """See `Pass.belief`."""
         state = NavState(self._R_WB, self._p_WB_W, self._R_WB @ self._v_WB_B, self._prior.b_a, self._prior.b_g)
-        return Belief(self._t_ns, state, np.full((15, 15), np.nan))
+        return Belief(self._t_ns, state, np.full((DIM, DIM), np.nan))
 
     def finish(self) -> Trajectory | None:
         """Dead reckoning has no smoothed states."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...datasets.epochs import Epoch, Voyage, cut
 from ...datasets.log import AttitudeStream, HeadingStream, Log
 from ...datasets.rig import Rig
-from ...datasets.state import Belief, TimeArray
+from ...datasets.state import DIM, Belief, TimeArray
 from ...datasets.trajectory import Trajectory
 from ...estimators.interface import Diverged, Estimator, Pass
 from ...estimators.physics.imu import compile_rig
@@ -47,7 +47,7 @@ class Recorder:
         self.t_ns = np.zeros(ticks, np.int64)
         self.R_WB = np.zeros((ticks, 3, 3))
         self.vectors = np.zeros((ticks, 4, 3))  # p_WB_W, v_WB_W, b_a, b_g
-        self.P = np.zeros((ticks, 15, 15))
+        self.P = np.zeros((ticks, DIM, DIM))
         self.has_P = True  # settled by the first belief
 
     def keep(self, belief: Belief, t_ns: int) -> None:

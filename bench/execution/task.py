@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets.trajectory import Trajectory
+from ...datasets.trajectory import COVARIANCE, Trajectory
 from ...estimators.registry import package_of
 from ..experiment.plan import Experiment, Run
 from ..files import write_whole, writing
@@ -132,12 +132,11 @@ def parquet(trajectory: Trajectory) -> bytes:
     from pyarrow.parquet import write_table
 
     columns: dict[str, Any] = {**trajectory.to_columns()}
-    for i in range(15):
-        for j in range(i, 15):
-            values = columns.pop(f"P_{i}_{j}", None)
-            if values is not None and i // 3 == j // 3:
-                with np.errstate(over="ignore"):  # a covariance that diverges may overflow
-                    columns[f"P_{i}_{j}"] = values.astype(np.float32)
+    for (i, j), name in COVARIANCE.items():
+        values = columns.pop(name, None)
+        if values is not None and i // 3 == j // 3:
+            with np.errstate(over="ignore"):  # a covariance that diverges may overflow
+                columns[name] = values.astype(np.float32)
     buffer = pa.BufferOutputStream()
     write_table(pa.table(columns), buffer, use_dictionary=False, write_statistics=False)
     return buffer.getvalue().to_pybytes()

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from ...datasets.state import Array
-from ...datasets.trajectory import Trajectory
+from ...datasets.trajectory import COVARIANCE, Trajectory
 from ..metrics import Alignment, Dims, ScoreError, align, associate
 from ..results.summary import Record
 
@@ -59,9 +59,8 @@ def _track(row: Record, folder: Path) -> Track | None:
 def load_trajectory(path: Path) -> Trajectory:
     """Read a saved trajectory; of its covariance the 3 × 3 blocks are kept, the rest is NaN."""
     table = pd.read_parquet(path)
-    if "P_0_0" in table:
-        across = [f"P_{i}_{j}" for i in range(15) for j in range(i, 15)]
-        table = table.reindex(columns=[*table.columns, *(name for name in across if name not in table)])
+    if COVARIANCE[0, 0] in table:
+        table = table.reindex(columns=[*table.columns, *(name for name in COVARIANCE.values() if name not in table)])
     return Trajectory.from_pandas(table)
 
 

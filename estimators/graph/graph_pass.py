@@ -77,10 +77,8 @@ class GraphPass:
         self._outliers: Counter[str] = Counter()
         self._solver = solver
         self._graph = gtsam.NonlinearFactorGraph()
-        self._newest = self._predicted = (
-            prior.state
-        )  # newest keyframe that is solved for; the next, as the IMU predicts it
-        self._solved = 0  # its index
+        self._newest, self._solved = prior.state, 0  # newest keyframe that is solved for, and its index
+        self._predicted = prior.state  # the keyframe after it, by the IMU
         self._belief: Belief | None = prior
         self._ticks: deque[int] = deque()
         self._smoothed: list[Belief] = []
@@ -241,7 +239,7 @@ class GraphPass:
         """Return the keyframe's state as a record, and the block from it to t_ns."""
         assert keyframe.before is not None
         block = np.zeros(1, BLOCK)
-        record = as_record(Belief(keyframe.t_ns, state, np.zeros((15, 15))))
+        record = as_record(Belief(keyframe.t_ns, state, np.zeros((DIM, DIM))))
         head, _ = split(keyframe.imu, t_ns)
         integrate(head, keyframe.before, state.b_a, state.b_g, self._rig, block)
         return record, block
@@ -283,7 +281,7 @@ class GraphPass:
                     self._covariance_due_ns = t_ns + int(self._config.smoothed_covariance_s * 1e9)
                     belief = self._solver.belief(keyframe.index, keyframe.t_ns)
                 else:
-                    belief = Belief(keyframe.t_ns, self._solver.state(keyframe.index), np.full((15, 15), np.nan))
+                    belief = Belief(keyframe.t_ns, self._solver.state(keyframe.index), np.full((DIM, DIM), np.nan))
                 self._smoothed.append(self._carried_on(keyframe, belief, t_ns))
 
     def _count_outliers(self, keyframe: Keyframe, values: gtsam.Values) -> None:

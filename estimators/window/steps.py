@@ -21,7 +21,7 @@ from ...datasets.state import DIM
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME
 from ..physics.elimination import absorb_row, divide_into
 from ..physics.imu import integrate, predict
-from ..physics.state import STATE, retract
+from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, retract
 from . import factors as forms
 from .chain import absorb_joint_row, back_substitute, copy_into, cross_tie
 from .factors import distance, linearise_factor, linearise_prior, linearise_tie
@@ -159,7 +159,7 @@ def move_along(
     first, biases = nodes[a].imu_from - v.imu_gone, np.empty((2, 3))
     x, d = points[a], nodes[a].d
     for i in range(3):
-        biases[0, i], biases[1, i] = x.b_a[i] + d[9 + i], x.b_g[i] + d[12 + i]
+        biases[0, i], biases[1, i] = x.b_a[i] + d[ACCEL_BIAS_0 + i], x.b_g[i] + d[GYRO_BIAS_0 + i]
     end = end_of(w, imu, first, t_ns)
     part = imu[first:end]
     if end < v.n_imu:
@@ -290,7 +290,7 @@ def solve(
     v.unsolved = v.newest + 1
     x, d = points[v.newest & mask], nodes[v.newest & mask].d
     for i in range(3):
-        if not math.isfinite(x.p_WB_W[i] + d[3 + i]):
+        if not math.isfinite(x.p_WB_W[i] + d[POSITION_0 + i]):
             return NOT_FINITE
     return SOLVED
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ....datasets.state import POSITION
 from ...drawing import (
     COLUMN_IN,
     TEXT_PT,
@@ -120,7 +121,7 @@ def _draw_error(axes: Axes, track: Track, axis: int, colour: str) -> None:
     t_s = (track.estimate.t_ns - track.estimate.t_ns[0]) * 1e-9
     if has_bounds(track):
         assert track.estimate.P is not None
-        variance = track.estimate.P[:, 3 + axis, 3 + axis]
+        variance = track.estimate.P[:, POSITION, POSITION][:, axis, axis]
         there = np.isfinite(variance)  # some smoothers keep the covariance of some states only
         t_there_s, bound = t_s[there], 3 * np.sqrt(variance[there].clip(min=0))
         if online:
