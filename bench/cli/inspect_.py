@@ -39,6 +39,7 @@ def inspect(
     """
     from rich.console import Console
 
+    from ...datasets.errors import shown
     from ..inspection.contents import print_contents
     from ..inspection.inspecting import inspect_log, open_to_inspect
     from ..inspection.page import page_file, print_inspection, save_page
@@ -57,7 +58,7 @@ def inspect(
         status.update(f"drawing {file}")
         save_page(inspection, file)
     print_inspection(inspection, console())
-    typer.echo(f"figure: {file}")
+    typer.echo(shown(f"figure: {file}"))
 
 
 def _undescribed(path: Path) -> Recording | None:

@@ -25,11 +25,12 @@ def simulate(
     The log is a folder of Parquet files with a log.yaml.
     """
     from ...datasets.described.folder import write_folder
+    from ...datasets.errors import shown
     from ...datasets.simulated import simulator
 
     log = simulator.simulate(_scenario(scenario), seed)
     write_folder(log, out)
-    typer.echo(f"{out}: {log.name}, {log.duration_s:.0f} s, {', '.join(['imu', *log.streams, 'truth'])}")
+    typer.echo(shown(f"{out}: {log.name}, {log.duration_s:.0f} s, {', '.join(['imu', *log.streams, 'truth'])}"))
 
 
 def _scenario(text: str) -> Scenario:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from ...datasets.errors import nearest
+from ...datasets.errors import nearest, shown
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import FACTORS, sensors_among
 from ..metrics.alignment import Alignment
@@ -67,7 +67,7 @@ class LogEntry:
         return tuple(
             replace(
                 full,
-                name=f"{name} {words}".rstrip(),
+                name=shown(f"{name} {words}".rstrip()),
                 scenario=None if self.scenario is None else changed(self.scenario, changes),
             )
             for words, changes in points(self.grid)
@@ -125,7 +125,7 @@ class EstimatorEntry:
         found = []
         for words, changes in points(self.grid):
             options = changed(self.options, changes)
-            full = EstimatorSpec(self.name, f"{label} {words}".rstrip(), options, self.baseline)
+            full = EstimatorSpec(self.name, shown(f"{label} {words}".rstrip()), options, self.baseline)
             has = full.create().factors
             less = {f"no {sensor}": has - {sensor} for sensor in self.drop}
             less |= {f"only {' + '.join(kept) or 'the IMU'}": frozenset(kept) for kept in self.only}
