@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .errors import DatasetError
+from .rotations import UNHEARD, complaint, off_rotation
 from .state import Array
 
 EARTH_RATE_RAD_S = 7.292115e-5
@@ -27,9 +28,10 @@ class Mounting:
 
     def __post_init__(self) -> None:
         R, p = np.asarray(self.R_BS, float), np.asarray(self.p_BS_B, float)
-        orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-9) and np.linalg.det(R) > 0
-        if not orthonormal:
-            raise DatasetError(f"mounting: R_BS must be a 3 × 3 rotation, found {self.R_BS!r}")
+        if R.shape != (3, 3):
+            raise DatasetError(f"mounting: R_BS must be a 3 × 3 rotation, found the shape {R.shape}")
+        if off_rotation(R) > UNHEARD:
+            raise DatasetError(f"mounting: R_BS must be a 3 × 3 rotation; it is {complaint(R, UNHEARD)}")
         if p.shape != (3,) or not np.isfinite(p).all():
             raise DatasetError(f"mounting: p_BS_B must be three finite metres, found {self.p_BS_B!r}")
 

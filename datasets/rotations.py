@@ -47,20 +47,20 @@ def orthonormalised(R: Array, off: Array) -> Array:
     return R
 
 
-def complaint(R: Array) -> str:
-    """Return why one matrix (3, 3) is not a rotation."""
+def complaint(R: Array, at_most: float = TOLERANCE) -> str:
+    """Return why one matrix (3, 3) is not a rotation; `at_most` is what it may be off."""
     if not np.isfinite(R).all():
         return f"not a rotation: {_row(R)} is not finite"
     with np.errstate(over="ignore"):
         if np.linalg.det(R) < 0:
             return f"not a rotation, but mirrors (an axis has the wrong sign): {_row(R)}"
-    return f"not a rotation: {_row(R)} is {off_rotation(R):.2g} off orthonormal axes (at most {TOLERANCE:g} is mended)"
+    return f"not a rotation: {_row(R)} is {off_rotation(R):.2g} off orthonormal axes; it may be {at_most:g} off"
 
 
 def complaint_of_quaternion(q: Array) -> str:
     """Return why one quaternion (4,) is not of unit length."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return f"not a unit quaternion (|q| = {np.linalg.norm(q):.6g}; at most {TOLERANCE:g} off one is mended)"
+        return f"not a unit quaternion (|q| = {np.linalg.norm(q):.6g}); it may be {TOLERANCE:g} off"
 
 
 def note(what: str, off: Array) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from ..formats.recording import Recording, loader
 from ..mounting import Matrix, MountingSpec
 from ..quantities import DEGREE, Finite, NotNegative, Positive, Vector
 from ..rig import ImuNoise
+from ..rotations import complaint, is_rotation, note, off_rotation, orthonormalised
 from ..state import LIMIT_NS, Array, Belief, NavState
 
 Sigma = Annotated[float, Field(gt=0)]
@@ -462,17 +463,22 @@ class PriorDescription(Part):
         if len(self.P) != 15 or any(len(row) != 15 for row in self.P):
             raise ValueError("P: expected 15 rows of 15")
         R, P = np.array(self.R_WB), np.array(self.P)
-        with np.errstate(over="ignore", invalid="ignore"):
-            if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
-                raise ValueError("R_WB is not a rotation")
+        if not is_rotation(off_rotation(R)):
+            raise ValueError(f"R_WB is {complaint(R)}")
         if not _is_covariance(P):
             raise ValueError("P is not symmetric and positive semi-definite")
         return self
 
     def belief(self) -> Belief:
-        """Return the belief, in our types."""
+        """Return the belief, in our types, its rotation without the rounding of its decimals."""
+        R_WB = np.array(self.R_WB)
         vectors = [np.array(x) for x in (self.p_WB_W, self.v_WB_W, self.b_a, self.b_g)]
-        return Belief(self.t_ns, NavState(np.array(self.R_WB), *vectors), np.array(self.P))
+        return Belief(self.t_ns, NavState(orthonormalised(R_WB, off_rotation(R_WB)), *vectors), np.array(self.P))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """That R_WB was orthonormalised, in a sentence; nothing where it was not."""
+        return note("prior", off_rotation(np.array([self.R_WB])))
 
 
 class Description(Part):

@@ -529,8 +529,8 @@ def test_a_truth_without_rows_is_refused(folder):
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("R_WB_00", 5.0, r"truth.csv: row 3 \(1 in all\): R_WB is not a rotation"),
-        ("R_WB_00", np.nan, r"truth.csv: row 3 \(1 in all\): R_WB is not a rotation"),
+        ("R_WB_00", 5.0, r"truth.csv: trajectory: row 3 \(1 in all\): R_WB is not a rotation"),
+        ("R_WB_00", np.nan, r"truth.csv: trajectory: row 3 \(1 in all\): R_WB is not a rotation"),
         ("t_ns", np.nan, r"truth.csv: trajectory: row 3: t_ns is nan, not a time"),
         ("t_ns", -9e18, r"truth.csv: trajectory: row 3: t_ns is -9e\+18, not a time"),
         ("p_WB_W_x", None, r"truth.csv: trajectory: missing columns: p_WB_W_x"),
