@@ -17,13 +17,14 @@ from ..errors import DatasetError, complaints, nearest
 from ..formats.columns import Column, Part, Table
 from ..formats.recording import Recording, loader
 from ..mounting import Matrix, MountingSpec
-from ..quantities import DEGREE, Finite, NotNegative, Positive, Vector
+from ..quantities import DEGREE, Finite, Latitude, Longitude, NotNegative, Number, Positive, Vector, Whole
 from ..rig import ImuNoise
 from ..rotations import complaint, is_rotation, note, off_rotation, orthonormalised
 from ..state import LIMIT_NS, Array, Belief, NavState
 
-Sigma = Annotated[float, Field(gt=0)]
-Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
+Sigma = Annotated[Number, Field(gt=0)]
+"""Infinite for a component that is not measured."""
+Shift = Annotated[Number, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
 """A shift of a time, s: at most 73 years, so that no sum overflows."""
 Checked = TypeVar("Checked", bound=BaseModel)
 
@@ -45,7 +46,7 @@ class Message(Part):
 
     names: Annotated[tuple[str, ...], Field(min_length=1)]
     """Several are joined by equal device times; columns are then `Name.field`."""
-    entity: int | None = None
+    entity: Whole | None = None
     """Which of several senders of that name. In IMC `src_ent`, any if left out; in ArduPilot the instance, which may
     be left out only if there is one."""
     clock: DeviceClock | None = None
@@ -203,19 +204,19 @@ class Outliers(Part):
     """The whole row is dropped if the norm of these components, in SI, exceeds `above`."""
 
     above: Positive
-    components: tuple[Annotated[int, Field(ge=0, le=2)], ...] | None = None
+    components: tuple[Annotated[Whole, Field(ge=0, le=2)], ...] | None = None
     """Which, from 0; all when left out."""
 
 
 class NoiseDescription(Part):
     """The IMU's noise, equal on three axes; `ImuNoise` has the units."""
 
-    gyro_density: NotNegative
-    accel_density: NotNegative
+    gyro_density: Positive
+    accel_density: Positive
     gyro_walk: NotNegative
     accel_walk: NotNegative
-    gyro_bias_sigma: NotNegative
-    accel_bias_sigma: NotNegative
+    gyro_bias_sigma: Positive
+    accel_bias_sigma: Positive
 
     def noise(self) -> ImuNoise:
         """Return the noise, in our types."""
@@ -240,7 +241,7 @@ class SourceDescription(Part):
 class StreamDescription(SourceDescription):
     """The keys that all streams have."""
 
-    every: Annotated[int, Field(ge=1)] = 1
+    every: Annotated[Whole, Field(ge=1)] = 1
     """Keep every n-th of the remaining rows."""
 
 
@@ -266,6 +267,8 @@ class AidingDescription(StreamDescription):
     def _one_sigma(self) -> Self:
         if (getattr(self, "sigma", None) is None) == (getattr(self, self.sigma_field) is None):
             raise ValueError(f"give one of `{self.sigma_field}` and `sigma` (columns)")
+        if np.isinf(np.asarray(getattr(self, self.sigma_field) or 0.0)).all():
+            raise ValueError(f"{self.sigma_field}: with no finite sigma the sensor measures nothing; leave it out")
         return self
 
 
@@ -403,12 +406,12 @@ class TruthDescription(Placed):
     tum: str | None = None
     trajectory: str | None = None
     """.parquet or .csv with the columns of `Trajectory.to_pandas`."""
-    lookahead_s: NotNegative | Annotated[float, Field(ge=0)] = 0.0
+    lookahead_s: Annotated[Number, Field(ge=0)] = 0.0
     table: Table | None = None
     message: Message | None = None
     time: Time | None = None
     valid: Valid | None = None
-    every: Annotated[int, Field(ge=1)] = 1
+    every: Annotated[Whole, Field(ge=1)] = 1
     height_m: Finite | None = None
     """Constant height above the sea surface, if the source has no height."""
     velocity: Velocity | None = None
@@ -431,8 +434,8 @@ class TruthDescription(Placed):
 class Origin(Part):
     """The origin of W."""
 
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
-    longitude_deg: Annotated[float, Field(ge=-360, le=360)]
+    latitude_deg: Latitude
+    longitude_deg: Longitude
 
 
 def _is_covariance(P: Array) -> bool:
@@ -449,7 +452,7 @@ def _is_covariance(P: Array) -> bool:
 class PriorDescription(Part):
     """A belief at the start, in our frames and SI."""
 
-    t_ns: Annotated[int, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
+    t_ns: Annotated[Whole, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
     R_WB: Matrix
     p_WB_W: Vector
     v_WB_W: Vector

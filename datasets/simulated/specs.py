@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from ..errors import nearest
 from ..mounting import MountingSpec
-from ..quantities import STRICT, Finite, NotNegative, Positive, Probability
+from ..quantities import STRICT, Finite, NotNegative, Number, Positive, Probability
 from ..rig import ImuNoise
 from .faults import DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults
 from .imu_grades import IMU_GRADES
@@ -53,7 +53,7 @@ class WavesSpec:
     """A sea state: significant height, period of the spectrum's peak, and where the waves run (from east, to north)."""
 
     height_m: Positive = 0.5
-    period_s: Annotated[float, Field(ge=4, le=30)] = 6.0
+    period_s: Annotated[Number, Field(ge=4, le=30)] = 6.0
     towards_deg: Finite = 0.0
 
     @model_validator(mode="after")
@@ -120,10 +120,10 @@ class DvlSpec:
 
     rate_hz: Positive = 5.0
     beam_sigma_m_s: Positive = 0.005
-    beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
+    beam_angle_deg: Annotated[Number, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
     min_range_m: NotNegative = 0.05  # along each beam, where there is a seabed
     max_range_m: Positive = 50.0
-    max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] | None = None  # of its axis from the vertical
+    max_tilt_deg: Annotated[Number, Field(gt=0, lt=90)] | None = None  # of its axis from the vertical
     beam_loss_probability: Probability = 0.0  # of each beam of each reading
     three_beams: bool = True  # whether three beams are enough for a reading
     delay_s: NotNegative = 0.0

@@ -125,3 +125,18 @@ def test_types_take_rotations_that_are_mended_already() -> None:
     t_ns = np.array([1])
     with pytest.raises(DatasetError, match=r"attitude: row 0 \(1 in all\) is not a rotation: .* off"):
         AttitudeStream(t_ns, t_ns, rounded.reshape(1, 9), np.ones((1, 3)))
+
+
+@pytest.mark.parametrize("name", ["gyro_density", "accel_density", "gyro_bias_sigma", "accel_bias_sigma"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, float("inf"), float("nan"), True])
+def test_an_imu_without_noise_is_refused(name: str, bad: float, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=f"`streams.imu.noise.{name}`"):
+        opened(tmp_path, imu={"noise": NOISE | {name: bad}})
+
+
+@pytest.mark.parametrize("sigma", [float("inf"), [float("inf")] * 3, 0.0, -1.0, float("nan"), [1.0, 0.0, 1.0], True])
+def test_a_sensor_that_measures_nothing_is_refused(sigma: Any, tmp_path: Path) -> None:
+    velocity = {"columns": [1, 2, 3], "unit": "m/s"}
+    part = {"table": {"file": "imu.csv", "header": False}, "time": {"column": 0}, "velocity": velocity}
+    with pytest.raises(DatasetError, match=r"streams\.dvl.*(with no finite sigma|greater than 0|expected a number)"):
+        opened(tmp_path, {"dvl": part | {"sigma_m_s": sigma}})
