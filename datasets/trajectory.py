@@ -133,8 +133,13 @@ class Trajectory:
                 file.write(f"{sign}{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
 
     @classmethod
-    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0) -> Trajectory:
+    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0, *, quoting: bool = True) -> Trajectory:
         """Read a TUM file; times keep their nanoseconds, and quaternions get the length one.
+
+        Args:
+            path: of the file.
+            lookahead_s: see the class.
+            quoting: whether an error may show a line of the file.
 
         Raises:
             DatasetError: names the file: it is missing or cannot be read, a row without eight numbers, a quaternion
@@ -149,7 +154,7 @@ class Trajectory:
                     if not fields or fields[0].startswith("#"):
                         continue
                     try:
-                        stamp_ns, pose = _pose(line, fields)
+                        stamp_ns, pose = _pose(line if quoting else "", fields)
                     except ValueError as error:
                         raise DatasetError(f"{path}: line {number}: {error}") from None
                     t_ns.append(stamp_ns)
@@ -219,7 +224,7 @@ class Trajectory:
 
 
 def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
-    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw.
+    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw; an error shows the line, if there is one.
 
     Raises:
         ValueError: what is wrong with it.
@@ -227,7 +232,8 @@ def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
-        raise ValueError(f"not numbers: {line.rstrip()[:60]!r}") from None
+        found = f": {line.rstrip()[:60]!r}" if line else "; is this a TUM file?"
+        raise ValueError(f"not numbers{found}") from None
     stamp_ns = seconds_to_ns(fields[0])
     if len(numbers) != 8:
         raise ValueError(f"expected t x y z qx qy qz qw, found {len(numbers)} fields")

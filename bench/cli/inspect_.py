@@ -45,9 +45,10 @@ def inspect(
     from ..inspection.page import page_file, print_inspection, save_page
     from ..output.tables.terminal import console
 
-    undescribed = _undescribed(Path(log))
+    path = Path(log).resolve() if Path(log).is_symlink() else Path(log)
+    undescribed = _undescribed(path)
     if undescribed is not None:
-        held = undescribed.contents(Path(log).parent)
+        held = undescribed.contents(path.parent)
         print_contents(held, console())
         return
     page_file(out, "")  # refuses before anything is read

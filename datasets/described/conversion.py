@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
-from ..files import regular_file
+from ..files import inside
 from ..formats.columns import EXACT, Columns, read_table
 from ..formats.recording import Recording, Wanted
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
@@ -656,9 +656,9 @@ def _truth(
     opening: _Opening, part: d.TruthDescription, rows: _Rows | None, origin: tuple[float, float] | None
 ) -> Trajectory:
     if part.tum is not None:
-        return Trajectory.from_tum(opening.folder / part.tum, part.lookahead_s)
+        return Trajectory.from_tum(inside(opening.folder, part.tum), part.lookahead_s)
     if part.trajectory is not None:
-        return _read_trajectory(opening.folder / part.trajectory, part.lookahead_s)
+        return _read_trajectory(inside(opening.folder, part.trajectory), part.lookahead_s)
     assert rows is not None
     R = None if part.attitude is None else _rotations(rows, part.attitude, origin)  # may drop rows, so it comes first
     before = rows.number
@@ -677,9 +677,9 @@ def _truth(
 def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     import pandas as pd
 
-    regular_file(path)
     try:
-        frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, **EXACT)
+        with path.open("rb") as file:  # of a name alone pandas might make an address or a home
+            frame = pd.read_parquet(file) if path.suffix == ".parquet" else pd.read_csv(file, **EXACT)
         truth = Trajectory.from_pandas(frame, lookahead_s).with_rotations()
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}") from None

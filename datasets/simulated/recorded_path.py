@@ -46,7 +46,7 @@ def follow(scenario: Scenario, path: Trajectory | None = None) -> Motion:
         if scenario.path is None:
             raise DatasetError("simulate: mission 'recorded' needs `path`, a TUM file, or a Trajectory")
         source = scenario.path
-        path = Trajectory.from_tum(source)
+        path = Trajectory.from_tum(source, quoting=False)  # the scenario may be somebody else's, and name any file
         digest = f", sha256 {hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]}"
     try:
         path = path.with_rotations()

@@ -1,4 +1,4 @@
-"""What comes in by a description or a scenario: rotations are mended alike and refused alike, whoever states them."""
+"""What comes in by a description or a scenario: rotations, noise, and files, which lie in the log's folder."""
 
 from __future__ import annotations
 
@@ -140,3 +140,104 @@ def test_a_sensor_that_measures_nothing_is_refused(sigma: Any, tmp_path: Path) -
     part = {"table": {"file": "imu.csv", "header": False}, "time": {"column": 0}, "velocity": velocity}
     with pytest.raises(DatasetError, match=r"streams\.dvl.*(with no finite sigma|greater than 0|expected a number)"):
         opened(tmp_path, {"dvl": part | {"sigma_m_s": sigma}})
+
+
+# -- files ------------------------------------------------------------------------------------------------------------
+
+SECRET = "root:x:0:0:hidden"
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of a log, beside a file that is not its business, and links to that."""
+    monkeypatch.delenv("FATHOM_DATA", raising=False)
+    (tmp_path / "secret.csv").write_text(f"{SECRET}\n{SECRET}\n")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "a.db3").write_text(SECRET)
+    folder = tmp_path / "log"
+    (folder / "bag").mkdir(parents=True)
+    for name in ("link.csv", "link.tum", "link.parquet", "link.npy", "link.lsf", "link.xml", "link.msg", "link.bag"):
+        (folder / name).symlink_to(tmp_path / "secret.csv")
+    (folder / "bag" / "a.db3").symlink_to(tmp_path / "bag" / "a.db3")
+    (folder / "there").symlink_to(tmp_path)
+    (folder / "circle.csv").symlink_to(folder / "circle.csv")
+    return folder
+
+
+def of_table(**table: Any) -> dict[str, Any]:
+    depth = {"columns": ["b"], "unit": "m"}
+    return {"streams": {"depth": {"table": table, "time": {"column": "a"}, "depth": depth, "sigma_m": 1}}}
+
+
+def of_recording(**recording: Any) -> dict[str, Any]:
+    depth = {"columns": ["a"], "unit": "m"}
+    part = {"message": {"names": ["Depth"]}, "time": {"column": "t"}, "depth": depth, "sigma_m": 1}
+    return {"streams": {"depth": part}, "recording": recording}
+
+
+NAMES = ["../secret.csv", "/etc/passwd", "there/secret.csv", "link.csv", "bag/../../secret.csv"]
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        *(of_table(file=name) for name in NAMES),
+        *({"truth": {"tum": name}} for name in NAMES),
+        *({"truth": {"trajectory": name}} for name in [*NAMES, "link.parquet"]),
+        of_table(file="link.parquet"),
+        of_table(arrays={"a": "link.npy", "b": "link.npy"}),
+        *(of_recording(format="imc", file=name) for name in [*NAMES, "link.lsf"]),
+        *(of_recording(format="ros", file=name) for name in [*NAMES, "link.bag", "bag", "there", "../bag"]),
+        *(of_recording(format=kind, file="link.csv") for kind in ("mcap", "ardupilot")),
+        of_recording(format="imc", file="imu.csv", definitions="link.xml"),
+        of_recording(format="ros", file="imu.csv.mcap", definitions=["link.msg"]),
+    ],
+    ids=lambda described: str(next(iter(described.values())))[:60],
+)
+def test_a_description_reads_no_file_elsewhere(described: dict[str, Any], outside: Path) -> None:
+    (outside / "imu.csv.mcap").write_bytes(b"")
+    streams = described.pop("streams", {})
+    with pytest.raises(DatasetError, match=r"outside the log's folder, where a log\.yaml reads no file") as error:
+        opened(outside, streams, **described)
+    assert "root:" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["~/secret.csv", "$HOME/imu.csv", "*.csv", "http://localhost/imu.csv", "file:///imu.csv"]
+)
+def test_a_name_is_a_name_and_nothing_else(name: str, outside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(outside.parent))
+    monkeypatch.chdir(outside)
+    with pytest.raises(DatasetError, match="no such file"):
+        opened(Path(), of_table(file=name)["streams"])
+    with pytest.raises(DatasetError, match="no such file"):
+        opened(Path(), truth={"trajectory": name})
+
+
+def test_a_circle_of_links_is_an_error(outside: Path) -> None:
+    with pytest.raises(DatasetError, match=r"circle.csv: cannot be read"):
+        opened(outside, of_table(file="circle.csv")["streams"])
+
+
+def test_the_folder_itself_and_its_parents_may_be_links(outside: Path) -> None:
+    opened(outside)
+    (outside.parent / "alias").symlink_to(outside)
+    assert len(open_log(outside.parent / "alias").imu.t_ns) == 20
+
+
+def test_the_data_folder_may_be_read_as_well(outside: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (outside.parent / "truth.tum").write_text("100 0 0 0 0 0 0 1\n101 0 0 0 0 0 0 1\n")
+    with pytest.raises(DatasetError, match="outside the log's folder, where"):
+        opened(outside, truth={"tum": "../truth.tum"})
+    assert open_log(outside, outside.parent).truth is not None
+    monkeypatch.setenv("FATHOM_DATA", str(outside.parent))
+    assert open_log(outside).truth is not None
+    with pytest.raises(DatasetError, match="outside the log's folder and the data folder"):
+        opened(outside, truth={"tum": "/etc/passwd"})
+
+
+def test_a_scenario_shows_nothing_of_the_file_that_it_names(outside: Path) -> None:
+    scenario = {"mission": "recorded", "path": str(outside.parent / "secret.csv")}
+    with pytest.raises(DatasetError, match=r"secret.csv: line 1: not numbers; is this a TUM file\?") as error:
+        simulate(Scenario.from_dict(scenario), 1)
+    assert "root:" not in str(error.value)
