@@ -462,6 +462,18 @@ def test_a_folder_that_holds_a_log_is_not_written_over(tmp_path):
     assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
 
 
+def test_nothing_is_written_through_a_link_and_nothing_stays_of_what_fails(tmp_path, monkeypatch):
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "dvl.parquet").symlink_to(tmp_path / "elsewhere.parquet")
+    with pytest.raises(DatasetError, match=r"holds a dvl.parquet already"):
+        write_folder(some_log(8), tmp_path / "log")
+    (tmp_path / "log" / "dvl.parquet").unlink()
+    monkeypatch.setattr("yaml.safe_dump", lambda *_, **__: "\udc80")  # the last file cannot be written
+    with pytest.raises(UnicodeEncodeError):
+        write_folder(some_log(8), tmp_path / "log")
+    assert not [*(tmp_path / "log").iterdir(), *tmp_path.glob("elsewhere*")]
+
+
 PRIOR: dict[str, Any] = {
     "t_ns": 100 * 10**9,
     "R_WB": np.eye(3).tolist(),
