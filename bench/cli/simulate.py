@@ -18,7 +18,7 @@ def simulate(
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="DIR", help="Folder to write; it must not hold a log already.")
     ],
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of all random numbers.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, metavar="N", help="Seed of all random numbers.")] = 1,
 ) -> None:
     """Simulate a mission and write it as a log.
 

@@ -108,6 +108,8 @@ def _euler_angles(source: str, path: Trajectory) -> Array:
 def _lay(source: str, t_s: Array, poses: Array, spacing_s: float | None) -> BSpline:
     if spacing_s is None:
         return make_interp_spline(t_s, poses, k=DEGREE_OF_SPLINES)
+    if (t_s[-1] - t_s[0]) > spacing_s * len(t_s):
+        raise _too_few(source, t_s, spacing_s)
     count = max(1, round((t_s[-1] - t_s[0]) / spacing_s))
     breaks = np.linspace(t_s[0], t_s[-1], count + 1)
     empty = np.flatnonzero(np.histogram(t_s, breaks)[0] == 0)
@@ -120,9 +122,13 @@ def _lay(source: str, t_s: Array, poses: Array, spacing_s: float | None) -> BSpl
     try:
         return make_lsq_spline(t_s, poses, knots, k=DEGREE_OF_SPLINES)
     except (ValueError, np.linalg.LinAlgError):
-        raise DatasetError(
-            f"{source}: {len(t_s)} poses are too few for knots every {spacing_s:g} s; make path_spacing_s longer"
-        ) from None
+        raise _too_few(source, t_s, spacing_s) from None
+
+
+def _too_few(source: str, t_s: Array, spacing_s: float) -> DatasetError:
+    return DatasetError(
+        f"{source}: {len(t_s)} poses are too few for knots every {spacing_s:g} s; make path_spacing_s longer"
+    )
 
 
 def _columns(spline: BSpline, columns: slice) -> BSpline:
