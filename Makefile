@@ -57,9 +57,9 @@ warm: .venv/dev
 
 # after a change of dependencies; what is pinned stays, as long as it fits
 pins:
-	$(PINS) --extra dev pyproject.toml --output-file constraints.txt
-	grep -o '^setuptools==[^ ]*' constraints.txt | $(PINS) --extra report --constraint constraints.txt pyproject.toml - \
-		--output-file constraints-bench.txt
+	$(PINS) --universal --extra dev pyproject.toml --output-file constraints.txt
+	grep -o '^setuptools==[^ ]*' constraints.txt | $(PINS) --universal --extra report --constraint constraints.txt \
+		pyproject.toml - --output-file constraints-bench.txt
 	printf 'setuptools==84.2.1\npytest>=8\nhypothesis>=6.100\n' | $(PINS) --resolution lowest-direct --extra report \
 		pyproject.toml - --output-file constraints-lowest.txt
 

@@ -69,7 +69,7 @@ def pins(name: str) -> dict[str, str]:
     text = (ROOT / name).read_text(encoding="utf-8")
     found = {}
     for entry in text.replace("\\\n", " ").splitlines():
-        line = re.fullmatch(r"([\w.-]+)==(\S+)((?: +--hash=sha256:[0-9a-f]{64})+) *", entry)
+        line = re.fullmatch(r"([\w.-]+)==(\S+)(?: ; [^\\]+?)?((?: +--hash=sha256:[0-9a-f]{64})+) *", entry)
         assert line, entry
         found[line[1]] = line[2]
     return found

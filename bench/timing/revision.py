@@ -183,7 +183,7 @@ def _dependencies(tree: Path) -> tuple[list[str], dict[str, str]]:
     with suppress(OSError):
         for line in (tree / "constraints.txt").read_text(encoding="utf-8").splitlines():
             name, _, pin = line.partition("==")
-            pins[_canonical(name)] = pin.strip(" \\")  # a line of hashes follows
+            pins[_canonical(name)] = re.split(r"[;\\]", pin)[0].strip()  # hashes follow
     return wanted, {name: pins[name] for name in sorted(_brought_along(wanted)) if name in pins}
 
 
