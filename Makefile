@@ -5,13 +5,14 @@
 PYTHON ?= python3
 DATA := $(firstword $(FATHOM_DATA) $(wildcard ../shared/data))
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PINS := uv pip compile --generate-hashes --no-header --no-annotate --no-emit-index-url --quiet --python-version 3.11
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist worksteal
 
 # Python keeps the bytecode it compiles, whatever the shell says: dozens of processes read the same sources
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: bench test fast timing reference lint types warm clean
+.PHONY: bench test fast timing reference lint types warm pins lowest clean
 
 bench: .venv/core
 	$(BIN)/fathom run filter_vs_smoother $(if $(DATA),--data $(DATA))
@@ -44,14 +45,34 @@ types: .venv/dev
 warm: .venv/dev
 	$(BIN)/python tests/warm.py
 
-.venv/core: pyproject.toml constraints.txt
+.venv/core: pyproject.toml constraints-bench.txt
 	$(PYTHON) -m venv .venv
-	$(PIP) --editable '.[report]'
+	$(PIP) --require-hashes --requirement constraints-bench.txt
+	$(PIP) --no-deps --no-build-isolation --editable .
 	touch $@
 
-.venv/dev: .venv/core
-	$(PIP) --editable '.[dev]'
+.venv/dev: .venv/core constraints.txt
+	$(PIP) --require-hashes --requirement constraints.txt
 	touch $@
+
+# after a change of dependencies; what is pinned stays, as long as it fits
+pins:
+	$(PINS) --universal --extra dev pyproject.toml --output-file constraints.txt
+	grep -o '^setuptools==[^ ]*' constraints.txt | $(PINS) --universal --extra report --constraint constraints.txt \
+		pyproject.toml - --output-file constraints-bench.txt
+	printf 'setuptools==84.2.1\npytest>=8\nhypothesis>=6.100\n' | $(PINS) --resolution lowest-direct --extra report \
+		pyproject.toml - --output-file constraints-lowest.txt
+
+# the lower bounds of pyproject.toml are true: what needs no compiling passes with them
+lowest:
+	rm -rf build/lowest
+	$(PYTHON) -m venv build/lowest
+	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement constraints-lowest.txt
+	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
+	build/lowest/bin/fathom list experiments >build/lowest/experiments
+	build/lowest/bin/python -m pytest -q -W ignore -m 'not slow' tests/datasets/test_errors.py tests/datasets/test_quantities.py \
+		tests/datasets/described/test_conversions.py tests/datasets/formats/test_columns.py \
+		tests/bench/output/test_hostile_text.py
 
 clean:
 	rm -rf .venv build *.egg-info

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
+from .files import regular_file
+from .rotations import TOLERANCE, complaint, is_rotation, note, off_rotation, off_unit, orthonormalised
 from .state import DIM, Array, Belief, NavState, TimeArray
 from .times import seconds_to_ns
 
@@ -36,6 +38,7 @@ class Trajectory:
         P: (n, 15, 15) covariance of the error state, or None; rows of NaN where it was not asked for.
         lookahead_s: how much of the future each state has seen: 0 for a filter, the lag for a fixed-lag smoother,
             infinity for a batch.
+        notes: what was mended on reading, one sentence each.
     """
 
     t_ns: TimeArray
@@ -46,6 +49,7 @@ class Trajectory:
     b_g: Array | None = None
     P: Array | None = None
     lookahead_s: float = 0.0
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.t_ns)
@@ -77,7 +81,21 @@ class Trajectory:
             pick(self.b_g),
             pick(self.P),
             self.lookahead_s,
+            self.notes,
         )
+
+    def with_rotations(self) -> Trajectory:
+        """Return it with the rounding of its decimals taken out of R_WB, which a note tells; rows of NaN are unknown.
+
+        Raises:
+            DatasetError: a row is not a rotation.
+        """
+        known = ~np.isnan(self.R_WB).all(axis=(1, 2))
+        off = np.where(known, off_rotation(self.R_WB), 0.0)
+        bad = np.flatnonzero(~is_rotation(off))
+        if len(bad):
+            raise DatasetError(f"trajectory: row {bad[0]} ({len(bad)} in all): R_WB is {complaint(self.R_WB[bad[0]])}")
+        return replace(self, R_WB=orthonormalised(self.R_WB, off), notes=(*self.notes, *note("trajectory", off)))
 
     def state(self, row: int) -> NavState:
         """Return one row as a state; unknown parts are zero."""
@@ -110,43 +128,46 @@ class Trajectory:
         q_xyzw = Rotation.from_matrix(self.R_WB).as_quat(canonical=True)
         with Path(path).open("w") as file:
             for t_ns, p, q in zip(self.t_ns.tolist(), self.p_WB_W.tolist(), q_xyzw.tolist(), strict=True):
-                seconds, rest = divmod(t_ns, 1_000_000_000)
-                file.write(f"{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
+                seconds, rest = divmod(abs(t_ns), 1_000_000_000)
+                sign = "-" if t_ns < 0 else ""
+                file.write(f"{sign}{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
 
     @classmethod
-    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0) -> Trajectory:
-        """Read a TUM file; times keep their nanoseconds.
+    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0, *, quoting: bool = True) -> Trajectory:
+        """Read a TUM file; times keep their nanoseconds, and quaternions get the length one.
+
+        Args:
+            path: of the file.
+            lookahead_s: see the class.
+            quoting: whether an error may show a line of the file.
 
         Raises:
             DatasetError: names the file: it is missing or cannot be read, a row without eight numbers, a quaternion
                 more than 1e-3 from unit length, an invalid time, or times out of order.
         """
-        path = Path(path)
+        path = regular_file(Path(path))
         t_ns, poses = array("q"), array("d")
         try:
-            with path.open(encoding="utf-8", errors="replace") as file:
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
                 for number, line in enumerate(file, 1):
                     fields = line.replace(",", " ").split()
                     if not fields or fields[0].startswith("#"):
                         continue
                     try:
-                        stamp_ns, pose = _pose(line, fields)
+                        stamp_ns, pose = _pose(line if quoting else "", fields)
                     except ValueError as error:
                         raise DatasetError(f"{path}: line {number}: {error}") from None
                     t_ns.append(stamp_ns)
                     poses.extend(pose)
-        except FileNotFoundError:
-            raise DatasetError(f"{path}: no such file") from None
-        except DatasetError:
-            raise
-        except (OSError, ValueError) as error:  # ValueError: a null character in the name
-            raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
         if not t_ns:
             raise DatasetError(f"{path}: no poses; expected lines of t x y z qx qy qz qw")
         values = np.array(poses).reshape(-1, 7)
         R_WB = Rotation.from_quat(values[:, 3:]).as_matrix()
         try:
-            return cls(np.array(t_ns, dtype=np.int64), R_WB, values[:, :3], lookahead_s=lookahead_s)
+            notes = note("trajectory", off_unit(values[:, 3:]))
+            return cls(np.array(t_ns, dtype=np.int64), R_WB, values[:, :3], lookahead_s=lookahead_s, notes=notes)
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
 
@@ -203,7 +224,7 @@ class Trajectory:
 
 
 def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
-    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw.
+    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw; an error shows the line, if there is one.
 
     Raises:
         ValueError: what is wrong with it.
@@ -211,11 +232,12 @@ def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
-        raise ValueError(f"not numbers: {line.rstrip()[:60]!r}") from None
+        found = f": {line.rstrip()[:60]!r}" if line else "; is this a TUM file?"
+        raise ValueError(f"not numbers{found}") from None
     stamp_ns = seconds_to_ns(fields[0])
     if len(numbers) != 8:
         raise ValueError(f"expected t x y z qx qy qz qw, found {len(numbers)} fields")
     length = math.hypot(*numbers[4:])
-    if not (all(map(math.isfinite, numbers)) and abs(length - 1) < 1e-3):
+    if not (all(map(math.isfinite, numbers)) and abs(length - 1) <= TOLERANCE):
         raise ValueError(f"not a finite pose with a unit quaternion (|q| = {length:.6g})")
     return stamp_ns, numbers[1:]

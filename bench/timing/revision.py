@@ -162,9 +162,12 @@ def _environment(tree: Path, folder: Path) -> tuple[Path, str]:
     python = folder / "bin" / "python"
     wanted = _dependencies(tree)[0]
     install = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    if (tree / "constraints.txt").is_file():
-        install += ["--constraint", str(tree / "constraints.txt")]
-    for command in ([sys.executable, "-m", "venv", str(folder)], [*install, *wanted]):
+    if (tree / "constraints-bench.txt").is_file():
+        install += ["--require-hashes", "--requirement", str(tree / "constraints-bench.txt")]
+    else:  # pins without hashes, or none
+        pins = tree / "constraints.txt"
+        install += [*(["--constraint", str(pins)] if pins.is_file() else []), *wanted]
+    for command in ([sys.executable, "-m", "venv", str(folder)], install):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1]
@@ -180,7 +183,7 @@ def _dependencies(tree: Path) -> tuple[list[str], dict[str, str]]:
     with suppress(OSError):
         for line in (tree / "constraints.txt").read_text(encoding="utf-8").splitlines():
             name, _, pin = line.partition("==")
-            pins[_canonical(name)] = pin.strip()
+            pins[_canonical(name)] = re.split(r"[;\\]", pin)[0].strip()  # hashes follow
     return wanted, {name: pins[name] for name in sorted(_brought_along(wanted)) if name in pins}
 
 

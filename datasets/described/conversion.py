@@ -20,10 +20,20 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
+from ..files import inside
 from ..formats.columns import EXACT, Columns, read_table
 from ..formats.recording import Recording, Wanted
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
 from ..rig import Rig
+from ..rotations import (
+    complaint,
+    complaint_of_quaternion,
+    is_rotation,
+    note,
+    off_rotation,
+    off_unit,
+    orthonormalised,
+)
 from ..state import Array, TimeArray
 from ..times import NS_PER, times_ns
 from ..trajectory import Trajectory
@@ -215,6 +225,11 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
+        opening.notes += (f"truth: {mended}" for mended in truth.notes)
+    for name, part in description.parts.items():
+        mounting = getattr(part, "mounting", None)
+        opening.notes += () if mounting is None else mounting.notes(name)
+    opening.notes += () if description.prior is None else description.prior.notes
 
     with _named(folder):
         mountings = {
@@ -505,12 +520,6 @@ def _heading(
     return HeadingStream(rows.t_ns, rows.received_ns, psi, _sigma(rows, part, 1))
 
 
-def _not_rotations(R: Array) -> Mask:
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        return np.asarray(~(off < 1e-6) | ~(np.linalg.det(R) > 0))
-
-
 def _enu_from_ecef(rows: _Rows, origin: tuple[float, float] | None) -> Array:
     """Return (3, 3): rows are east, north and up at W's origin, in ECEF axes."""
     if origin is None:
@@ -526,17 +535,17 @@ def _rotations(rows: _Rows, part: d.Attitude, origin: tuple[float, float] | None
         R = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix().reshape(-1, 3, 3)
     elif part.form == "matrix":
         R = values.reshape(-1, 3, 3)
-        bad = _not_rotations(R)
-        rows.refuse(bad, lambda row: f"not a rotation matrix: {values[row]}", "that are not rotations")
-        R = R[~bad]
+        off = off_rotation(R)
+        good = is_rotation(off)
+        rows.refuse(~good, lambda row: complaint(R[row]), "that are not rotations")
+        rows.opening.notes += note(rows.stream, off[good])
+        R = orthonormalised(R[good], off[good])
     else:
-        with np.errstate(over="ignore"):
-            length = np.linalg.norm(values, axis=1)
-        bad = ~(np.abs(length - 1) < 1e-3)
-        rows.refuse(
-            bad, lambda row: f"not a unit quaternion (|q| = {length[row]:.6g})", "that are not unit quaternions"
-        )
-        q_xyzw = values[~bad] if part.form == "quaternion_xyzw" else np.roll(values[~bad], -1, axis=1)
+        off = off_unit(values)
+        good = is_rotation(off)
+        rows.refuse(~good, lambda row: complaint_of_quaternion(values[row]), "that are not unit quaternions")
+        rows.opening.notes += note(rows.stream, off[good])
+        q_xyzw = values[good] if part.form == "quaternion_xyzw" else np.roll(values[good], -1, axis=1)
         R = Rotation.from_quat(q_xyzw).as_matrix().reshape(-1, 3, 3)
     if part.world == "NED":
         R = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]) @ R
@@ -647,9 +656,9 @@ def _truth(
     opening: _Opening, part: d.TruthDescription, rows: _Rows | None, origin: tuple[float, float] | None
 ) -> Trajectory:
     if part.tum is not None:
-        return Trajectory.from_tum(opening.folder / part.tum, part.lookahead_s)
+        return Trajectory.from_tum(inside(opening.folder, part.tum), part.lookahead_s)
     if part.trajectory is not None:
-        return _read_trajectory(opening.folder / part.trajectory, part.lookahead_s)
+        return _read_trajectory(inside(opening.folder, part.trajectory), part.lookahead_s)
     assert rows is not None
     R = None if part.attitude is None else _rotations(rows, part.attitude, origin)  # may drop rows, so it comes first
     before = rows.number
@@ -668,11 +677,10 @@ def _truth(
 def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     import pandas as pd
 
-    if not path.is_file():
-        raise DatasetError(f"{path}: no such file")
     try:
-        frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, **EXACT)
-        truth = Trajectory.from_pandas(frame, lookahead_s)
+        with path.open("rb") as file:  # of a name alone pandas might make an address or a home
+            frame = pd.read_parquet(file) if path.suffix == ".parquet" else pd.read_csv(file, **EXACT)
+        truth = Trajectory.from_pandas(frame, lookahead_s).with_rotations()
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}") from None
     except KeyError as error:
@@ -682,10 +690,4 @@ def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     bad = np.flatnonzero(~np.isfinite(truth.p_WB_W).all(axis=1))
     if len(bad):
         raise DatasetError(f"{path}: row {bad[0]} ({len(bad)} in all): position is {truth.p_WB_W[bad[0]]}")
-    unknown = np.isnan(truth.R_WB).all(axis=(1, 2))
-    bad = np.flatnonzero(_not_rotations(truth.R_WB) & ~unknown)
-    if len(bad):
-        raise DatasetError(
-            f"{path}: row {bad[0]} ({len(bad)} in all): R_WB is not a rotation: {truth.R_WB[bad[0]].ravel()}"
-        )
     return truth
