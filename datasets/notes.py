@@ -15,7 +15,7 @@ KINDS = {
     "outside": "readings lay outside the IMU's time",
     "late_dropped": "readings came too late to be used",
     "gated": "readings were rejected by a gate, or got less weight from a robust loss",
-    "late_used": "readings came late and were used",
+    "late": "readings were received later than they were true",
     "merged": "readings were taken as of the time of another keyframe or epoch",
     "carried": "readings were tied by the IMU to the keyframe before them",
     "void": "readings measured nothing: every sigma was infinite",

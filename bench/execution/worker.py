@@ -17,6 +17,7 @@ import numpy as np
 
 from ...datasets.errors import DatasetError
 from ...datasets.log import Log
+from ...datasets.notes import as_data
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
 from ..experiment.plan import plain
@@ -126,7 +127,7 @@ class WorkerCache:
             "duration_s": result.duration_s,
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
-            "notes": json.dumps([*log.notes, *result.notes]),
+            "notes": json.dumps([as_data(note) for note in (*log.notes, *result.notes)]),
             **costs(result),
             **extra,
         }

@@ -217,11 +217,14 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
 def late_or_out(summary: Sequence[Record]) -> Sheet | None:
     """Return what became of late readings and outliers; None where there were none."""
     outliers = [name for name in summary[0] if name.startswith(OUTLIERS)]
-    counts = {"readings": "readings", "late_used": "late,\nused", "late_dropped": "late,\ndropped"}
+    counts = {"readings": "readings", "late": "late", "late_dropped": "late,\ndropped"}
     counts |= {"carried": "carried"} | {name: f"outliers\n{name.removeprefix(OUTLIERS)}" for name in outliers}
-    if not any(row[name] for row in summary for name in ("late_used", "late_dropped", *outliers)):
+    if not any(row[name] for row in summary for name in ("late", "late_dropped", *outliers)):
         return None
-    note = ["counts over all runs; carried: tied to the keyframe before by the IMU"]
+    note = [
+        "counts over all runs; late: received more than 1 ms after they were true; carried: tied by the IMU to the "
+        "keyframe before"
+    ]
     if outliers:
         note.append(
             "outliers: rejected by a filter's gate, or beyond the width of a loss; of Gaussian readings Huber's has "

@@ -26,13 +26,8 @@ SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
 SEEDS_ENOUGH = 5
 """With fewer seeds the interval of ANEES is too wide to be useful, so only NIS, if requested, is tabulated."""
 
-COUNTS = {
-    "readings": ("readings",),
-    "late_used": ("late_used", "replayed"),  # by a smoother, by a filter that rewinds
-    "late_dropped": ("late",),
-    "carried": ("carried",),
-}
-"""Counts of readings that were late or between keyframes; summed over seeds."""
+COUNTS = {"readings": "readings", "late": "readings_late", "late_dropped": "late", "carried": "carried"}
+"""Counts of readings that were late or between keyframes, by their names in a run; summed over seeds."""
 
 UNFINISHED = ("diverged", "failed", "absent")
 """How a run ends that does not finish."""
@@ -80,7 +75,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         key: [run[0]["status"] for run in groups(of, "seed").values()]
         for key, of in groups(every, "log", "label").items()
     }
-    counted = COUNTS | {name: (name,) for name in _outliers(every)}
+    counted = COUNTS | {name: name for name in _outliers(every)}
     summary = []
     for (log, label, output), group in groups(every, "log", "label", "output").items():
         done = [row for row in group if row["status"] == "done"]
@@ -98,7 +93,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= _over_floor(done)
         record |= _consistency(done)
         counts = [json.loads(row["counts"] or "{}") for row in done]
-        record |= {name: sum(run.get(of, 0) for run in counts for of in each) for name, each in counted.items()}
+        record |= {name: sum(run.get(of, 0) for run in counts) for name, of in counted.items()}
         summary.append(record)
     return summary
 
