@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from ..results.summary import OUTLIERS, Record, groups
 from .cells import (
     ABSENT,
     ACCURACY,
+    KNOWN,
     NEES_NOTE,
     ONLINE,
     Cell,
@@ -38,6 +39,19 @@ SHORT = {"position": "pos", "attitude": "att", "velocity": "vel", "biases": "bia
 
 SHOWN_OF_IDENTITY = 8
 """Letters of a run's identity that a table shows: enough to tell millions of runs apart."""
+
+
+UNITS = {column.unit for column in KNOWN.values()}
+
+MOST_LISTED = 4
+"""Names that a sentence lists; with their commas they fill half a line of 80 columns."""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return different names, the first few of them, with commas: "a, b, c, d and 3 more"."""
+    each = list(dict.fromkeys(names))
+    more = f" and {len(each) - MOST_LISTED} more" if len(each) > MOST_LISTED else ""
+    return ", ".join(each[:MOST_LISTED]) + more
 
 
 class Line(NamedTuple):
@@ -79,9 +93,24 @@ class Sheet:
 
     @property
     def notes(self) -> list[str]:
-        """The note, and why cells are empty."""
-        why = dict.fromkeys(cell.why for line in self.lines for cell in line.cells if cell.why)
-        return [*self.note, *([f"{ABSENT}: {'; '.join(why)}"] if why else [])]
+        """The note, and a line for each reason why cells are empty: of which columns, and of whom if not of all."""
+        return [*self.note, *(f"{ABSENT} {text}" for text in self.reasons)]
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why cells are empty: "NEES: no ground truth", "heading, drift (eskf): no run finished"."""
+        columns: dict[str, list[str]] = {}
+        names: dict[str, list[str]] = {}
+        for line in self.lines:
+            for heading, each in zip(self.headings[1:], line.cells, strict=True):
+                if each.why:
+                    columns.setdefault(each.why, []).append(_without_unit(heading))
+                    names.setdefault(each.why, []).append(line.name)
+        every = {line.name for line in self.lines}
+        return [
+            f"{listed(columns[why])}{f' ({listed(names[why])})' if {*names[why]} < every else ''}: {why}"
+            for why in columns
+        ]
 
     def by_output(self) -> dict[str, list[Line]]:
         """Return the lines by section and output, the least lag first: only outputs of equal lag are ranked."""
@@ -95,6 +124,12 @@ class Sheet:
         for line in sorted(self.lines, key=place):
             found.setdefault(", ".join(filter(None, (line.section, line.output))), []).append(line)
         return found
+
+
+def _without_unit(heading: str) -> str:
+    """Return a heading on one line, without its unit."""
+    name, _, below = heading.partition("\n")
+    return name if below in UNITS else f"{name} {below}".rstrip()
 
 
 def _line(row: Record, cells: list[Cell], **other: Any) -> Line:

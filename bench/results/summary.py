@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from itertools import count
 from statistics import fmean, median
 from typing import Any, TypeAlias
@@ -68,7 +69,8 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
     Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES and coverage are means;
     costs are medians. `done` of `runs` are pooled; `diverged`, `failed` and `absent` count the rest; where none is
     done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, per degree of freedom, with
-    the number of those times at which it lies above and below its interval. `start` lists where the priors came from.
+    the number of those times at which it lies above and below its interval. `start` lists where the priors came from,
+    `missing` says by a score's name why it is None.
     """
     every = records(rows)
     ends = {
@@ -94,6 +96,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= _consistency(done)
         counts = [json.loads(row["counts"] or "{}") for row in done]
         record |= {name: sum(run.get(of, 0) for run in counts) for name, of in counted.items()}
+        record["missing"] = {name: why for name, why in _missing(done).items() if record.get(name) is None}
         summary.append(record)
     return summary
 
@@ -102,6 +105,25 @@ def _rpe_step(group: Sequence[Record]) -> Record:
     """Return the step of a group's RPE, from its spec; None where that is not known."""
     scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
     return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
+
+
+def _missing(done: Sequence[Record]) -> dict[str, str]:
+    """Return why scores are missing, by their name: the first reason that a run gives."""
+    found: dict[str, str] = {}
+    for row in done:
+        found = why_missing(row) | found
+    return found
+
+
+def why_missing(row: Record) -> dict[str, str]:
+    """Return by the name of each missing score why, from a row of a run."""
+    return {name: why for why, names in _reasons(row.get("missing") or "{}").items() for name in names}
+
+
+@lru_cache(maxsize=256)
+def _reasons(text: str) -> dict[str, list[str]]:
+    """Return the JSON of a row; the runs of a log mostly have the same."""
+    return json.loads(text)
 
 
 def _pooled(done: Sequence[Record], name: str, n: str) -> float | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ...metrics.scoring import by_reason
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, groups, is_judged, records, summarise
@@ -25,8 +27,9 @@ ANY_WIDTH = 10_000
 
 
 def write_table(rows: pd.DataFrame, path: Path) -> None:
-    """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field."""
-    pd.DataFrame(summarise_with_intervals(rows)).to_csv(path, index=False)
+    """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field, and `missing` why."""
+    summary = [row | {"missing": json.dumps(by_reason(row["missing"]))} for row in summarise_with_intervals(rows)]
+    pd.DataFrame(summary).to_csv(path, index=False)
 
 
 def write_consistency(rows: pd.DataFrame, path: Path) -> None:
