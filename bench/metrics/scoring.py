@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from typing import Annotated, Any, NamedTuple, TypeAlias
@@ -165,7 +166,11 @@ def _or_why(names: Iterable[str], part: Callable[..., Found], *args: Any) -> Fou
     try:
         return part(*args)
     except ScoreError as error:
-        return dict.fromkeys(names, str(error))
+        return dict.fromkeys(names, PREFIX.sub("", str(error)))
+
+
+PREFIX = re.compile(r"^(nees|rpe|coverage|segments): ")
+"""The function that raised a reason; the score's name says it already."""
 
 
 def by_reason(missing: Mapping[str, str]) -> dict[str, list[str]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from textwrap import fill
 
 import pandas as pd
 from rich.cells import cell_len
@@ -17,11 +18,13 @@ from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, groups, is_judged, records, summarise
 from ...results.summary import consistency as consistency_of
-from .. import sheets
+from .. import notices, sheets
 from ..cells import Cell
 from ..remarks import failures, mostly_outside, not_positive
 from . import terminal
 
+LETTERS = 80
+"""Longest line of what the runs noticed, also where there is more room: longer ones are hard to read."""
 ANY_WIDTH = 10_000
 """More letters than any table is wide; in less room rich gives the width after cutting."""
 
@@ -72,10 +75,13 @@ def print_differences(differences: Sequence[Record], console: Console) -> None:
 
 
 def print_remarks(rows: pd.DataFrame, console: Console) -> None:
-    """Print a line for each run that did not finish, and for results that are not to be trusted."""
+    """Print a line for each run that did not finish, for results not to be trusted, and for what the runs noticed."""
     every = records(rows)
     for line in failures(every) + mostly_outside(every) + not_positive(summarise(rows)):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
+    for line, routine in notices.lines(every):
+        told = fill(line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False)
+        console.print(told, style="dim" if routine else "yellow", highlight=False, markup=False, soft_wrap=True)
 
 
 def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> None:

@@ -310,8 +310,9 @@ HOSTILE = """</script><script>alert("x")</script><img src=x onerror=alert(1)><a 
 
 def test_hostile_text_is_inert(rows: pd.DataFrame, folder: Path, browser: Any, tmp_path: Path) -> None:
     spec = json.dumps({"estimator": {"name": HOSTILE}, HOSTILE: 1})
+    notes = json.dumps([{"kind": kind, "text": HOSTILE} for kind in ("damage", "about")])
     bad = rows.assign(
-        log=HOSTILE, experiment=HOSTILE, notes=json.dumps([HOSTILE]), counts=json.dumps({HOSTILE: 3}), spec=spec,
+        log=HOSTILE, experiment=HOSTILE, notes=notes, counts=json.dumps({HOSTILE: 3}), spec=spec,
         machine=json.dumps({"cpu": HOSTILE}), start=HOSTILE, identity=HOSTILE, truth_kind=HOSTILE,
         label=rows["label"] + HOSTILE, cause=rows["cause"].mask(rows["cause"].notna(), HOSTILE),
     )  # fmt: skip
