@@ -33,6 +33,9 @@ COUNTS = {"readings": "readings", "late": "readings_late", "late_dropped": "late
 UNFINISHED = ("diverged", "failed", "absent")
 """How a run ends that does not finish."""
 
+LONGEST_NAME = 100
+"""Letters of a log's name in the name of a file, which has 255 at most, with what it is added to."""
+
 OUTLIERS = "outliers_"
 """Prefix of the counts of readings that an estimator rejected, or gave less weight, as outliers."""
 
@@ -56,7 +59,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     """Return for each name one that files and LaTeX labels can have; no two differ only in capitals."""
     found: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)
+        stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)[:LONGEST_NAME]
         taken = {other.lower() for other in found.values()}
         numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
         found[name] = next(one for one in numbered if one.lower() not in taken)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from textwrap import fill
 
@@ -86,13 +87,16 @@ def print_remarks(rows: pd.DataFrame, console: Console) -> None:
 
 def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> None:
     """Print a table; on a narrow console in parts, one below the other, so that no number is cut off."""
-    whose, columns = _whose(sheet), _columns(sheet)
+    whose, columns, title = _whose(sheet), _columns(sheet), sheet.title
+    each = (_width(_table(sheet, [*whose, column], console.width), console) for column in columns)
+    unfolded = console.width if max(each, default=0) <= console.width else 0
     while columns:
         fitting = len(columns)
-        while fitting > 1 and _width(_table(sheet, whose + columns[:fitting]), console) > console.width:
+        while fitting > 1 and _width(_table(sheet, whose + columns[:fitting], unfolded), console) > console.width:
             fitting -= 1
-        console.print(_table(sheet, whose + columns[:fitting]))
+        console.print(_table(sheet, whose + columns[:fitting], unfolded))
         columns = columns[fitting:]
+        sheet = replace(sheet, title=f"{title} (continued)" if title else "")
         if noted and not columns:
             console.print(Text("\n".join(sheet.notes), "table.caption"))
         console.print()
@@ -129,8 +133,8 @@ def _parts(cell: Cell, width: int) -> Iterator[str]:
         yield cell.interval
 
 
-def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
-    """Lay out some columns of a table, with the names before them, each name once."""
+def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]], width: int) -> Table:
+    """Lay out some columns of a table for a console of this width, with the names before them, each name once."""
     headings = [sheet.headings[0], *(column[0] for column in columns)]
     tall = any("\n" in heading for heading in headings)
     shown, above = [], ""
@@ -139,7 +143,7 @@ def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
         shown.append(f"{'' if top == above else top}\n{below}" if tall else below)
         above = top
     names = [line.name for line in sheet.lines]
-    table = terminal.plain_table(shown[0], names, sheet.title)
+    table = terminal.plain_table(shown[0], names, sheet.title, width)
     for heading, (_, *texts) in zip(shown[1:], columns, strict=True):
         width = max(map(cell_len, (*heading.split("\n"), *texts)))
         table.add_column(heading, justify="right", no_wrap=True, min_width=width)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from fathom.bench.output import cells, sheets
+from fathom.bench.output.report import runs
 from fathom.bench.output.tables.table import print_sheet
 from rich.console import Console
 
@@ -123,7 +124,14 @@ def test_no_number_is_cut_however_narrow_the_terminal_is(width: int) -> None:
     assert (
         " ".join(printed.split()).count("– error, drift (an estimator with a name that goes on): no ground truth") == 1
     )
-    assert (printed.count("title") > 1) == (width < 200)
+    assert (printed.count("title (continued)") > 0) == (printed.count("title") > 1) == (width < 200)
+
+
+def test_a_name_is_not_folded_where_80_columns_have_room_for_it() -> None:
+    console = Console(width=80, record=True)
+    name = "fls preintegrated lag 10"
+    print_sheet(sheets.Sheet("t", [], HEADINGS, [sheets.Line(name, [cells.Cell("12,345.67")] * 6)]), console)
+    assert console.export_text().count(name) == 2
 
 
 def test_a_name_is_not_folded_inside_a_word() -> None:
@@ -150,3 +158,12 @@ def test_the_pages_script_formats_no_number() -> None:
         text = script.read_text(encoding="utf-8")
         found = re.findall(r"toFixed|toPrecision|toLocaleString|NumberFormat|%\{[xy]|hindsight|\(m\)|, m\b", text)
         assert not found, script.name
+
+
+def test_the_report_says_how_many_logs_are_scored_against_what() -> None:
+    row = {"label": "eskf", "seed": None, "status": "done", "align": "none", "output": "online"}
+    rows = [
+        row | {"log": log, "truth_kind": kind} for log, kind in zip("abc", ["truth", "reference", "truth"], strict=True)
+    ]
+    assert dict(runs.facts(rows[:1]))["against"] == "ground truth"
+    assert dict(runs.facts(rows))["against"] == "ground truth: 2 logs; a reference, which is not ground truth: 1 log"
