@@ -60,7 +60,9 @@ def _of_counts(log: Log, counts: Mapping[str, int]) -> Iterator[Note]:
     """Yield what a run counted of gaps and readings."""
     readings, dropped = counts["readings"], counts.get("late", 0)
     if n := counts["imu_gaps_bridged"]:
-        yield Note(f"imu: {n} gaps bridged, each by holding the last sample", "gap", "imu", n)
+        ms = counts.get("imu_gaps_ms")
+        seconds = None if ms is None else ms * 1e-3
+        yield Note(f"imu: {n} gaps bridged, each by holding the last sample", "gap", "imu", n, seconds=seconds)
     found = {
         "late_dropped": (dropped, "came too late and were dropped"),
         "late": (counts["readings_late"], "were received more than 1 ms after they were true"),

@@ -148,8 +148,9 @@ def scored(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> Scor
         aligned, parts = align(truth, estimate, scoring.align), ALIGNED | ANYWAY
     except ScoreError as error:
         aligned, parts = estimate, ANYWAY
-        found |= dict.fromkeys((name for names in ALIGNED.values() for name in names), str(error))
-        found |= _heading(truth, estimate)
+        heading = _heading(truth, estimate)
+        why = f"{error}{'; the heading is scored unaligned' if heading else ''}"
+        found |= dict.fromkeys((name for names in ALIGNED.values() for name in names), why) | heading
     for part, names in parts.items():
         found |= dict.fromkeys(names, "not defined for this run") | _or_why(names, part, log, truth, aligned, scoring)
     found |= _consistency(log, truth, estimate, scoring)

@@ -65,7 +65,8 @@ def test_a_missing_score_has_its_reason(log: Log, estimate: Trajectory, scoring:
 
 def test_what_needs_no_alignment_is_scored_where_none_is_determined() -> None:
     turned = replace(TRUTH, R_WB=TRUTH.R_WB @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]))
-    values, _ = scored(MOORED, turned, Scoring(align="yaw", rpe_unit="s", rpe_delta=1.0))
+    values, missing = scored(MOORED, turned, Scoring(align="yaw", rpe_unit="s", rpe_delta=1.0))
+    assert missing["ate_rmse_m"].endswith("the heading is scored unaligned")
     assert values["heading_rmse_deg"] == pytest.approx(90.0, abs=1.0)
     assert values["gyro_bias_rmse_rad_s"] == 0.0
     assert values["rpe_rmse_m"] is not None
