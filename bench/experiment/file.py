@@ -83,7 +83,7 @@ def _default_name(log: LogSpec) -> str:
     return f"{scenario.mission}-{noise}" if isinstance(noise, str) else scenario.mission
 
 
-Sensors = Annotated[Names, sensors_among(FACTORS)]
+Sensors = Annotated[tuple[str, ...], sensors_among(FACTORS)]
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -346,16 +346,24 @@ def _difference(row: Record) -> Line:
         cells = [
             Cell(text(row["baseline"]), row["baseline"]),
             Cell(signed(row["difference"]), row["difference"]),
-            Cell(interval(row["low"], row["high"], signed) or ABSENT, row["low"]),
-            Cell(percent(row["ratio"]), row["ratio"]),
-            Cell(ABSENT if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p),
-            Cell(ABSENT if r is None else f"{r:+.2f}", r),
+            _or_absent(interval(row["low"], row["high"], signed), row["low"], f"intervals need {FEWEST_SEEDS} seeds"),
+            _or_absent(percent(row["ratio"]), row["ratio"], "a ratio needs numbers above zero"),
+            _or_absent("" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p, NO_TEST),
+            _or_absent("" if r is None else f"{r:+.2f}", r, NO_TEST),
         ]
         output = output_and_lag(row["output"], seen)
         output += "" if lag(seen) == lag(other) else f", against lag {lag(other)}"
     else:
         cells, output = [Cell(ABSENT, why="no seed that both finished")] * 6, "no seed that both finished"
     return Line(variant(row), [*cells, seeds], output, both, seen, column(row["score"]).raw)
+
+
+NO_TEST = f"no test: it needs {FEWEST_SEEDS} seeds of a simulated log that both finished"
+
+
+def _or_absent(shown: str, value: float | None, why: str) -> Cell:
+    """Return the cell of a number, or of none with the reason."""
+    return Cell(ABSENT, why=why) if value is None else Cell(shown, value)
 
 
 def _paired_note(paired: Sequence[Record]) -> list[str]:

@@ -209,7 +209,7 @@ def test_a_wrong_key_or_value_is_named_with_its_place_and_neighbour(changes: dic
         ({"estimators": "eskf"}, {"estimators": [{"name": "eskf"}]}),
         ({"estimators": {"name": "eskf"}}, {"estimators": [{"name": "eskf"}]}),
         (
-            {"estimators": ["eskf", {"name": "eskf", "label": "b", "drop": "gps"}]},
+            {"estimators": ["eskf", {"name": "eskf", "label": "b", "drop": ["gps"]}]},
             {"estimators": [{"name": "eskf"}, {"name": "eskf", "label": "b", "drop": ["gps"]}]},
         ),
         ({"logs": ["box", "a/folder"]}, {"logs": [{"scenario": {"mission": "box"}}, {"log": "a/folder"}]}),
