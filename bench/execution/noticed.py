@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...datasets.log import Log, ReadingStream
 from ...datasets.notes import Note
@@ -27,7 +28,7 @@ def late_readings(log: Log, sensors: Collection[str], start_ns: int, end_ns: int
     )
 
 
-def _between(stream: ReadingStream, start_ns: int, end_ns: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _between(stream: ReadingStream, start_ns: int, end_ns: int) -> NDArray[np.bool_]:
     """Return which readings are driven through: true after the start, received by the end, and not void."""
     measures = np.isfinite(stream.sigma).any(axis=1)
     return (stream.t_ns > start_ns) & (stream.received_ns <= end_ns) & measures

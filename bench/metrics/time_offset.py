@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from ...datasets.state import Array
+from ...datasets.state import Array, TimeArray
 from ...datasets.trajectory import Trajectory
 from .alignment import Alignment, align
 from .association import ScoreError, associate
@@ -82,7 +82,7 @@ def _error_m(true: Trajectory, estimate: Trajectory, offset_s: float, mode: Alig
     return np.inf if error is None else error
 
 
-def _interpolated(estimate: Trajectory, t_ns: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Array:
+def _interpolated(estimate: Trajectory, t_ns: TimeArray) -> Array:
     """Return the estimate's positions at other times within its own, (n, 3) m, linear in between."""
     start_ns = estimate.t_ns[0]
     return np.stack([np.interp(t_ns - start_ns, estimate.t_ns - start_ns, x) for x in estimate.p_WB_W.T], axis=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from itertools import chain
 from textwrap import shorten
 from typing import Any, NamedTuple
 
@@ -135,18 +136,24 @@ def _notice(log: str, kind: str, stream: str, each: Sequence[tuple[Record, dict[
 
 def lines(rows: Sequence[Record]) -> Iterator[tuple[str, bool]]:
     """Yield lines for the terminal, the worst first, and whether each is routine; logs that say the same share one."""
-    every = notices(rows)
-    for (kind,), of_kind in groups([notice._asdict() | {"notice": notice} for notice in every], "kind").items():
-        said: dict[str, list[str]] = {}
-        for (log,), of_log in groups(of_kind, "log").items():
-            said.setdefault(_sentence(kind, [row["notice"] for row in of_log]), []).append(log)
+    for kind, logs in _by_kind_and_log(rows).items():
         if kind in ROUTINE:
-            most = max((row["notice"] for row in of_kind), key=lambda notice: (notice.share, notice.count or 0))
-            logs = len({row["log"] for row in of_kind})
-            more = f" (the most of {logs} logs)" if logs > 1 else ""
-            said = {f"{_sentence(kind, [most])}{more}": [most.log]}
-        for sentence, logs in said.items():
-            yield f"{listed(logs)}: {sentence}", kind in ROUTINE
+            most = max(chain.from_iterable(logs.values()), key=lambda notice: (notice.share, notice.count or 0))
+            more = f" (the most of {len(logs)} logs)" if len(logs) > 1 else ""
+            yield f"{most.log}: {_sentence(kind, [most])}{more}", True
+            continue
+        said: dict[str, list[str]] = {}
+        for log, of_log in logs.items():
+            said.setdefault(_sentence(kind, of_log), []).append(log)
+        for sentence, named in said.items():
+            yield f"{listed(named)}: {sentence}", False
+
+
+def _by_kind_and_log(rows: Sequence[Record]) -> dict[str, dict[str, list[Notice]]]:
+    found: dict[str, dict[str, list[Notice]]] = {}
+    for notice in notices(rows):
+        found.setdefault(notice.kind, {}).setdefault(notice.log, []).append(notice)
+    return found
 
 
 def _sentence(kind: str, of: Sequence[Notice]) -> str:
@@ -164,8 +171,7 @@ def _sentence(kind: str, of: Sequence[Notice]) -> str:
 
 def sentences(rows: Sequence[Record]) -> list[str]:
     """Return a sentence per kind, for the notes of a printed table of one log."""
-    kinds = groups([notice._asdict() | {"notice": notice} for notice in notices(rows)], "kind")
-    return [_sentence(kind, [row["notice"] for row in of]) for (kind,), of in kinds.items()]
+    return [_sentence(kind, [*chain.from_iterable(logs.values())]) for kind, logs in _by_kind_and_log(rows).items()]
 
 
 def sheet(rows: Sequence[Record]) -> Sheet | None:
