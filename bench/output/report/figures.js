@@ -61,7 +61,7 @@
       }));
       if (truth) {
         const ink = colour("ink");
-        traces.unshift({ type: "scatter", mode: "lines", name: kind, x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
+        traces.unshift({ type: "scatter", mode: "lines", name: plain(kind), x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
         traces.push({ type: "scatter", mode: "markers", name: "start", x: truth[0].slice(0, 1), y: truth[1].slice(0, 1), marker: { color: ink, size: 9 }, hoverinfo: "name" });
       }
       const layout = { xaxis: { title: { text: axes.east } }, yaxis: { title: { text: axes.north }, scaleanchor: "x" } };
