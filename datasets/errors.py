@@ -121,6 +121,8 @@ EXPECTED = {
     "string_type": "text",
     "finite_number": "a finite number",
     "none_required": "null",
+    "invalid_key": "text as a key",
+    "string_pattern_mismatch": "text that matches {pattern}",
     "literal_error": "{expected}",
     "enum": "{expected}",
     "too_short": "a list of at least {min_length}",

@@ -11,6 +11,7 @@ from .reproduce import reproduce
 from .run import run
 from .score import score
 from .simulate import simulate
+from .stdout import set_up
 from .timing import timing
 from .tune import tune
 from .verb import Verb
@@ -21,6 +22,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 for name, verb in (
     ("run", run),
@@ -38,6 +40,7 @@ app.add_typer(timing, name="timing")
 
 def main() -> None:
     """Run the command line."""
+    set_up()
     app()
 
 

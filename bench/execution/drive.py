@@ -22,13 +22,11 @@ from ...datasets.trajectory import Trajectory
 from ...estimators.interface import Diverged, Estimator, Pass
 from ...estimators.physics.imu import compile_rig
 from ...estimators.physics.innovation import INNOVATION, innovations
+from .noticed import ON_TIME_NS, late_readings, noticed
 from .result import Result, Status
 
 LOST_M = 1e7
 """An estimate farther than this from W's origin has diverged, m: a quarter of the Earth's circumference."""
-
-ON_TIME_NS = 1_000_000
-"""A reading at most this much older than its epoch counts as simultaneous: 1 ms, in which 2 m/s is 2 mm."""
 
 
 class Ending(NamedTuple):
@@ -179,6 +177,11 @@ def run_log(
             counts = dict(run.counts)
 
     driven = voyage.epochs[: len(recorder.step_ns)]
+    end_ns = driven[-1].t_ns if driven else voyage.start_ns
+    late = late_readings(log, estimator.factors, voyage.start_ns, end_ns)
+    counts = (
+        {"readings": readings, "readings_late": late} | voyage.counts | (collector.counts if collector else {}) | counts
+    )
     return Result(
         ending.status,
         ending.cause,
@@ -188,11 +191,11 @@ def run_log(
         np.array(recorder.step_ns, np.int64),
         np.array(recorder.belief_ns, np.int64),
         finish_ns,
-        {"readings": readings} | voyage.counts | (collector.counts if collector else {}) | counts,
-        (driven[-1].t_ns - voyage.start_ns) * 1e-9 if driven else 0.0,
+        counts,
+        (end_ns - voyage.start_ns) * 1e-9,
         sum(len(epoch.imu) for epoch in driven),
         start,
-        notes,
+        (*notes, *noticed(log, counts)),
         collector.table() if collector else None,
     )
 

@@ -66,7 +66,7 @@ COLUMNS = {
     "nis_depth": "",
     "nis_gps": "",
     "nis_heading": "",
-    "late_used": None,
+    "late": None,
     "late_dropped": None,
 }
 """Of a reference table; nothing in it depends on how fast a machine is."""

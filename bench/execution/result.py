@@ -31,12 +31,13 @@ class Result:
         step_ns: (epochs,) time of each `step`.
         belief_ns: (ticks,) time of each `belief`.
         finish_ns: time of `finish`.
-        counts: what happened to readings, gaps and solvers, by name.
+        counts: what happened to readings, gaps and solvers, by name. "readings_late" counts readings that came late,
+            by the log alone; those of them that were dropped are "late".
         duration_s: how much of the log was driven through.
         imu_samples: how many IMU samples went in.
         start: where the prior came from: "given" by the log's maker, else what `initialise` found: "static", "moving",
             and after a comma what is unusual in that.
-        notes: how the start was found, in sentences.
+        notes: how the start was found and what was noticed of the readings, in sentences; see `datasets.notes.Note`.
         nis: INNOVATION rows, in the order of reception; None where they were not asked for.
     """
 

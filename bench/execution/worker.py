@@ -17,6 +17,7 @@ import numpy as np
 
 from ...datasets.errors import DatasetError, one_line
 from ...datasets.log import Log
+from ...datasets.notes import as_data
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
 from ..experiment.plan import plain
@@ -24,7 +25,7 @@ from ..metrics import ScoreError
 from ..metrics.consistency import nees_at
 from ..metrics.floor import Floor, floors
 from ..metrics.floor_ratio import FLOORS, floor_scores
-from ..metrics.scoring import can_judge, scores
+from ..metrics.scoring import INNOVATIONS, by_reason, can_judge, scored
 from ..results.identity import content_sha256
 from ..results.store import Row
 from .drive import run_log, warm_up
@@ -99,14 +100,20 @@ class WorkerCache:
         return estimator
 
     def floor(self, task: Task, result: Result, lookahead_s: float) -> dict[str, float | None]:
-        """Return the scores of FLOORS for one look-ahead; None where there are none: of a recorded log, say.
+        """Return the scores of FLOORS for one look-ahead; None where they are not asked for.
 
         The floors of all the experiment's lags are found together, once for all estimators that use the same sensors.
+
+        Raises:
+            ScoreError: there is none.
         """
         run, scoring = task.run, task.scoring
-        asked = scoring.floor and run.log.scenario is not None and (scoring.align, scoring.dims) == ("none", "3d")
-        if not asked or result.status != "done" or result.online is None:
+        if not scoring.floor:
             return dict.fromkeys(FLOORS)
+        if run.log.scenario is None or (scoring.align, scoring.dims) != ("none", "3d"):
+            raise ScoreError("the floor is known for simulated logs only, unaligned and in 3d")
+        if result.status != "done" or result.online is None:
+            raise ScoreError("the run did not finish, so it has no floor")
         assert run.seed is not None
         factors = run.estimator.create().factors
         key = f"{log_key(task)} {sorted(factors)} {scoring.score_period_s} {task.max_gap_s}"
@@ -126,7 +133,7 @@ class WorkerCache:
             "duration_s": result.duration_s,
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
-            "notes": json.dumps([*log.notes, *result.notes]),
+            "notes": json.dumps([as_data(note) for note in (*log.notes, *result.notes)]),
             **costs(result),
             **extra,
         }
@@ -140,13 +147,18 @@ class WorkerCache:
         for output, trajectory in result.outputs.items():
             name = file_name(task, output, task.identity)
             files[name] = parquet(trajectory)
-            row = task.row(result.status, result.cause, output) | shared | scores(log, trajectory, scoring)
+            values, missing = scored(log, trajectory, scoring)
+            row = task.row(result.status, result.cause, output) | shared | values
             if output == "online":
                 row |= innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))}
             try:
                 row |= self.floor(task, result, trajectory.lookahead_s)
             except ScoreError as error:  # a look-ahead that is not defined, say: the other scores stand
-                row["notes"] = json.dumps([*log.notes, *result.notes, str(error)])
+                missing |= dict.fromkeys(FLOORS, str(error))
+            if scoring.nis:
+                why = "innovations are of the online output" if output != "online" else "no such reading came in time"
+                missing |= {name: why for name in INNOVATIONS if row.get(name) is None}
+            row["missing"] = json.dumps(by_reason(missing))
             if can_judge(log, scoring):
                 row["nees_at"] = json.dumps(nees_at(log, trajectory, scoring.nees_epochs))
             rows.append(row | {"lookahead_s": trajectory.lookahead_s, "trajectory": name})

@@ -19,6 +19,7 @@ from ..metrics.alignment import Alignment
 from ..metrics.comparison import OVER_SEEDS
 from ..metrics.pose_error import Dims
 from ..metrics.scoring import Scoring
+from .names import Names, estimator_entry, log_entry, one_or_many, scoring_entry
 from .specs import EstimatorSpec, LogSpec
 from .variants import Grid, changed, points
 
@@ -46,7 +47,7 @@ class LogEntry:
     align: Alignment | None = None
     dims: Dims | None = None
     grid: Grid = Field(default_factory=dict)
-    estimators: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    estimators: Annotated[Names, Field(min_length=1)] | None = None
     baseline: str | None = None
 
     @model_validator(mode="after")
@@ -166,8 +167,8 @@ class SplitPatterns:
             half of the seeds of simulated logs is for training and the rest is held out; recorded logs are not used.
     """
 
-    train: tuple[str, ...] = ()
-    held_out: tuple[str, ...] = ()
+    train: Names = ()
+    held_out: Names = ()
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -179,7 +180,8 @@ class Settings:
         description: what it asks, in a sentence or two.
         seeds: of the simulated logs, or how many, counted from 1; all estimators share a seed's log, so differences are
             paired.
-        scores: how runs are scored; a log may override `align` and `dims`.
+        scores: how runs are scored, or a list of such keys and of names of scores to ask for ("nis", "floor"); a log
+            may override `align` and `dims`.
         baseline: the label with which every estimator is compared that names no other.
         compare: scores in which variants are compared with their baselines; every one more is more tests to correct
             for.
@@ -193,9 +195,9 @@ class Settings:
     seeds: Annotated[
         tuple[Annotated[Whole, Field(ge=0, lt=2**63)], ...], Field(min_length=1), BeforeValidator(_counted_from_one)
     ] = (1,)
-    scores: Scoring = Scoring()
+    scores: Annotated[Scoring, BeforeValidator(scoring_entry)] = Scoring()
     baseline: str | None = None
-    compare: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_can_be_compared)] = (
+    compare: Annotated[Names, Field(min_length=1), AfterValidator(_can_be_compared)] = (
         "ate_rmse_m",
         "heading_rmse_deg",
         "velocity_rmse_m_s",
@@ -207,10 +209,10 @@ class Settings:
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class ExperimentFile(Settings):
-    """An experiment as it was read; `Experiment` is what it stands for."""
+    """An experiment as it was read; `Experiment` is what it stands for. A name alone is an entry without other keys."""
 
-    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1)]
-    estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1)]
+    logs: Annotated[tuple[LogEntry, ...], Field(min_length=1), one_or_many(log_entry)]
+    estimators: Annotated[tuple[EstimatorEntry, ...], Field(min_length=1), one_or_many(estimator_entry)]
 
 
 def refuse_unknown(complaint: str, name: str | None, known: Iterable[str]) -> None:

@@ -65,6 +65,7 @@ class Experiment(Settings):
         Raises:
             ExperimentError: unknown or missing key, unknown estimator, option or mission, a value that does not fit.
         """
+        _refuse_no_text(content, source)
         try:
             asked = TypeAdapter(ExperimentFile).validate_python(content)
             return cls(
@@ -150,3 +151,21 @@ def find_experiment(name_or_path: str | Path) -> Path:
             f"{name}: no such experiment or file{nearest(name, shipped)} (shipped: {', '.join(shipped)})"
         )
     return path
+
+
+def _refuse_no_text(content: Any, source: str) -> None:
+    """Refuse a character that no file can hold: half of a surrogate pair, which YAML can write as "\\ud800".
+
+    Raises:
+        ExperimentError: names the text.
+    """
+    if isinstance(content, str):
+        try:
+            content.encode()
+        except UnicodeEncodeError:
+            raise ExperimentError(f"{source}: {content!r:.60} has a character that is no text; leave it out") from None
+    elif isinstance(content, Mapping):
+        _refuse_no_text([*content, *content.values()], source)
+    elif isinstance(content, list | tuple):
+        for each in content:
+            _refuse_no_text(each, source)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from typing import Annotated
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
@@ -12,6 +14,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from ...datasets.epochs import SENSOR
 from ...datasets.log import Log
 from ...datasets.quantities import Number, Positive, Whole
+from ...datasets.state import Array
 from ...datasets.trajectory import Trajectory
 from .absolute_error import ate, drift, horizontal_error, outage_drift
 from .alignment import Alignment, align
@@ -19,7 +22,7 @@ from .association import ScoreError, associate
 from .floor_ratio import FLOORS
 from .pose_error import Dims
 from .relative_error import Pairs, Unit, check_step, rpe, segment_errors
-from .state_error import BLOCKS, coverage, nees, not_positive, state_errors
+from .state_error import BLOCKS, Block, coverage, nees, not_positive, state_errors
 
 SCORES = {
     "n_scored": "poses compared",
@@ -109,26 +112,85 @@ class Scoring:
         return self
 
 
-def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict[str, float | None]:  # noqa: B008
-    """Return every score of SCORES by name; None where it is not defined for this log and estimate.
+class Scored(NamedTuple):
+    """The scores of one trajectory.
 
-    Consistency is scored only where `can_judge` holds.
+    Attributes:
+        values: every score of SCORES by name; None where it is not defined for this log and estimate.
+        missing: by the name of each that is None, why, in a sentence.
     """
-    row: dict[str, float | None] = dict.fromkeys(SCORES)
+
+    values: dict[str, float | None]
+    missing: dict[str, str]
+
+
+def scores(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> dict[str, float | None]:  # noqa: B008
+    """Return the values of `scored`."""
+    return scored(log, estimate, scoring).values
+
+
+def scored(log: Log, estimate: Trajectory, scoring: Scoring = Scoring()) -> Scored:  # noqa: B008
+    """Return every score of SCORES, and the reason of each that is missing.
+
+    Consistency is scored only where `can_judge` holds. Where no alignment is determined, as with a truth that does not
+    move, those scores are left that alignment does not change (RPE, sub-trajectories, biases), and the heading, as it
+    is.
+    """
+    values: dict[str, float | None] = dict.fromkeys(SCORES)
     if log.truth is None:
-        return row
+        return Scored(values, dict.fromkeys(SCORES, "no ground truth"))
     try:
         truth, estimate = associate(log.truth, estimate)
-        aligned = align(truth, estimate, scoring.align)
-    except ScoreError:
-        return row
-    row["n_scored"] = len(truth)
-    for part in (_absolute, _state, _relative, _segments, _drift, _outages, _horizontal):
-        with suppress(ScoreError):
-            row |= part(log, truth, aligned, scoring)
-    if can_judge(log, scoring):
-        row |= _consistency(truth, estimate)
-    return row
+    except ScoreError as error:
+        return Scored(values, dict.fromkeys(SCORES, str(error)))
+    found: dict[str, float | str] = {"n_scored": len(truth)}
+    try:
+        aligned, parts = align(truth, estimate, scoring.align), ALIGNED | ANYWAY
+    except ScoreError as error:
+        aligned, parts = estimate, ANYWAY
+        heading = _heading(truth, estimate)
+        why = f"{error}{'; the heading is scored unaligned' if heading else ''}"
+        found |= dict.fromkeys((name for names in ALIGNED.values() for name in names), why) | heading
+    for part, names in parts.items():
+        found |= dict.fromkeys(names, "not defined for this run") | _or_why(names, part, log, truth, aligned, scoring)
+    found |= _consistency(log, truth, estimate, scoring)
+    values |= {name: value for name, value in found.items() if not isinstance(value, str)}
+    return Scored(values, {name: why for name, why in found.items() if isinstance(why, str)})
+
+
+Found: TypeAlias = dict[str, float | str]
+"""A score's value by its name, or why there is none."""
+
+
+def _or_why(names: Iterable[str], part: Callable[..., Found], *args: Any) -> Found:
+    """Return the scores of a part, or the reason that it raises for each of these names."""
+    try:
+        return part(*args)
+    except ScoreError as error:
+        return dict.fromkeys(names, PREFIX.sub("", str(error)))
+
+
+PREFIX = re.compile(r"^(nees|rpe|coverage|segments): ")
+"""The function that raised a reason; the score's name says it already."""
+
+
+def by_reason(missing: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the names of the missing scores by their reason, as a row of the store holds them."""
+    found: dict[str, list[str]] = {}
+    for name, why in missing.items():
+        found.setdefault(why, []).append(name)
+    return found
+
+
+def _lacks(what: str, of_truth: Array | None, log: Log) -> str:
+    """Return whether it is the truth or the estimate that has no such part."""
+    there = of_truth is not None and not np.isnan(of_truth).all()
+    return f"no {what} in the estimate" if there else f"no {what} in the {truth_name(log.truth_kind)}"
+
+
+def truth_name(kind: str) -> str:
+    """Return what a truth of this kind is called: "ground truth", or its kind."""
+    return "ground truth" if kind == "truth" else kind
 
 
 def can_judge(log: Log, scoring: Scoring) -> bool:
@@ -136,69 +198,121 @@ def can_judge(log: Log, scoring: Scoring) -> bool:
     return log.truth is not None and log.truth_kind == "truth" and scoring.align == "none"
 
 
-def _consistency(truth: Trajectory, estimate: Trajectory) -> dict[str, float | None]:
+def _consistency(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     """Return NEES and coverage; absent for a block without truth, or without a valid covariance."""
-    row: dict[str, float | None] = {}
+    names = [name for name in SCORES if name.startswith(("nees_", "within_", "n_not_positive"))]
+    if not can_judge(log, scoring):
+        return dict.fromkeys(names, "covariances are judged only against ground truth, unaligned")
+    found: Found = {}
     for block in BLOCKS:
-        with suppress(ScoreError):
-            each = nees(truth, estimate, block)
-            if not np.isnan(each).all():
-                row[f"nees_{block}"] = float(np.nanmean(each))
+        found |= _or_why([f"nees_{block}"], _nees, truth, estimate, block)
     for block in ("position", "all"):
-        with suppress(ScoreError):
-            shares = coverage(truth, estimate, block)
-            row |= {f"within_{k}sigma_{block}": share for k, share in enumerate(shares, 1)}
-    with suppress(ScoreError):
-        row["n_not_positive"] = 0 if "nees_all" in row else len(not_positive(estimate))
-    return row
+        found |= _or_why([f"within_{k}sigma_{block}" for k in (1, 2, 3)], _coverage, truth, estimate, block)
+    sound = not isinstance(found["nees_all"], str)
+    return found | ({"n_not_positive": 0} if sound else _or_why(["n_not_positive"], _not_positive, estimate))
 
 
-def _absolute(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _nees(truth: Trajectory, estimate: Trajectory, block: Block) -> Found:
+    each = nees(truth, estimate, block)
+    known = not np.isnan(each).all()
+    return {f"nees_{block}": float(np.nanmean(each)) if known else NO_COVARIANCE}
+
+
+def _coverage(truth: Trajectory, estimate: Trajectory, block: Block) -> Found:
+    shares = coverage(truth, estimate, block)
+    return {f"within_{k}sigma_{block}": share for k, share in enumerate(shares, 1)}
+
+
+def _not_positive(estimate: Trajectory) -> Found:
+    return {"n_not_positive": len(not_positive(estimate))}
+
+
+def _absolute(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     e = ate(truth, estimate, dims=scoring.dims)
-    names = ("rmse_m", "mean_m", "median_m", "max_m")
-    row = {f"ate_{name}": getattr(e, name) for name in names}
-    return row | {"rotation_rmse_deg": e.rotation_rmse_deg, "heading_rmse_deg": e.heading_rmse_deg}
+    found: Found = {f"ate_{name}": getattr(e, name) for name in ("rmse_m", "mean_m", "median_m", "max_m")}
+    for name in ("rotation_rmse_deg", "heading_rmse_deg"):
+        value = getattr(e, name)
+        found[name] = _lacks("attitude", truth.R_WB, log) if value is None else value
+    return found
 
 
-def _state(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _heading(truth: Trajectory, estimate: Trajectory) -> Found:
+    """Return the heading's error without alignment, where there is one."""
+    with suppress(ScoreError):  # the reason why nothing is aligned stands
+        value = state_errors(truth, estimate).heading_deg
+        if value is not None:
+            return {"heading_rmse_deg": value}
+    return {}
+
+
+def _velocity(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
+    value = state_errors(truth, estimate).velocity_m_s
+    return {"velocity_rmse_m_s": _lacks("velocity", truth.v_WB_W, log) if value is None else value}
+
+
+def _biases(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     e = state_errors(truth, estimate)
+    accel, gyro = e.accel_bias_m_s2, e.gyro_bias_rad_s
     return {
-        "velocity_rmse_m_s": e.velocity_m_s,
-        "accel_bias_rmse_m_s2": e.accel_bias_m_s2,
-        "gyro_bias_rmse_rad_s": e.gyro_bias_rad_s,
+        "accel_bias_rmse_m_s2": _lacks("accelerometer bias", truth.b_a, log) if accel is None else accel,
+        "gyro_bias_rmse_rad_s": _lacks("gyro bias", truth.b_g, log) if gyro is None else gyro,
     }
 
 
-def _relative(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _relative(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     e = rpe(truth, estimate, scoring.rpe_delta, scoring.rpe_unit, scoring.rpe_pairs, dims=scoring.dims)
     return {"rpe_rmse_m": e.rmse_m, "rpe_rotation_rmse_deg": e.rotation_rmse_deg, "n_rpe": e.n}
 
 
-def _segments(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _segments(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     each = segment_errors(truth, estimate, scoring.segment_lengths_m, dims=scoring.dims).values()
     n = sum(e.n for e in each)
     if n == 0:
-        return {}
+        shortest_m = min(scoring.segment_lengths_m, default=0.0)
+        raise ScoreError(f"the track is shorter than every sub-trajectory ({shortest_m:g} m and more)")
     return {
         "segment_percent": sum(e.n * e.translation_mean_percent for e in each) / n,
         "segment_deg_m": sum(e.n * e.rotation_mean_deg_m for e in each) / n,
     }
 
 
-def _drift(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _drift(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     e = drift(truth, estimate)
+    if e.end_percent is None or e.max_percent is None:
+        raise ScoreError(f"the {truth_name(log.truth_kind)} does not move")
     return {"drift_end_percent": e.end_percent, "drift_max_percent": e.max_percent}
 
 
-def _outages(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _outages(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     gps_t_ns = np.zeros(0, np.int64) if log.gps is None else log.gps.received_ns
-    each = [e.growth_percent for e in outage_drift(truth, estimate, gps_t_ns) if e.growth_percent is not None]
-    return {"outage_percent": max(each, default=None)}
+    outages = outage_drift(truth, estimate, gps_t_ns)
+    each = [e.growth_percent for e in outages if e.growth_percent is not None]
+    if not each:
+        still = f"the {truth_name(log.truth_kind)} does not move while GPS is silent"
+        raise ScoreError(still if outages else "GPS is never silent for 30 s")
+    return {"outage_percent": max(each)}
 
 
-def _horizontal(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> dict[str, float | None]:
+def _horizontal(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     e = horizontal_error(truth, estimate)
     return {"cep50_m": e.cep50_m, "drms_m": e.drms_m}
+
+
+NO_COVARIANCE = "no pose has a covariance and a known error"
+ALIGNED: dict[Callable[..., Found], tuple[str, ...]] = {
+    _absolute: ("ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_max_m", "rotation_rmse_deg", "heading_rmse_deg"),
+    _velocity: ("velocity_rmse_m_s",),
+    _drift: ("drift_end_percent", "drift_max_percent"),
+    _outages: ("outage_percent",),
+    _horizontal: ("cep50_m", "drms_m"),
+}
+"""Parts of the scores that alignment changes, and the names in each."""
+ANYWAY: dict[Callable[..., Found], tuple[str, ...]] = {
+    _biases: ("accel_bias_rmse_m_s2", "gyro_bias_rmse_rad_s"),
+    _relative: ("rpe_rmse_m", "rpe_rotation_rmse_deg", "n_rpe"),
+    _segments: ("segment_percent", "segment_deg_m"),
+}
+"""Those that it does not change."""
 
 
 POOLED = {

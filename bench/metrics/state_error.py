@@ -131,7 +131,7 @@ def not_positive(estimate: Trajectory) -> TimeArray:
         ScoreError: the estimate has no P.
     """
     if estimate.P is None:
-        raise ScoreError("the estimate has no covariances; the estimator must be asked for them")
+        raise ScoreError("the estimate has no covariances: its estimator keeps none, or must be asked for them")
     rows = np.flatnonzero(~np.isnan(estimate.P).any(axis=(1, 2)))
     try:
         np.linalg.cholesky(estimate.P[rows])
@@ -158,7 +158,7 @@ def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns:
         raise ScoreError(f"nees: no block {block!r}; known: {', '.join(BLOCKS)}")
     truth, estimate = associate(truth, estimate, tolerance_ns)
     if estimate.P is None:
-        raise ScoreError("nees: the estimate has no covariances; the estimator must be asked for them")
+        raise ScoreError("nees: the estimate has no covariances: its estimator keeps none, or must be asked for them")
     check_finite(estimate)
     of = BLOCKS[block]
     e = error_state(truth, estimate)[:, of]

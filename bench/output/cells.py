@@ -9,8 +9,8 @@ import math
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from ..metrics.scoring import SCORES
-from ..results.summary import Record
+from ..metrics.floor_ratio import OVER
+from ..results.summary import Record, why_missing
 
 ABSENT = "–"
 ONLINE, SMOOTHED = "online", "smoothed"
@@ -198,18 +198,14 @@ def absent(score: str, row: Record) -> Cell:
 def _reason(score: str, row: Record) -> str:
     if not (row["done"] if "done" in row else row["status"] == "done"):
         return "no run finished"
+    missing = row["missing"] if isinstance(row["missing"], dict) else why_missing(row)
+    if score in missing:
+        return missing[score]
     if score.startswith("nis_"):
         return "no innovations (smoothed, or no reading in time)"
-    judges_covariance = score.startswith(("nees_", "anees_", "within_"))
-    if row["truth_kind"] is None and (judges_covariance or score in SCORES):
-        return "no ground truth"
-    if judges_covariance:
-        judged = row["truth_kind"] == "truth" and row["align"] == "none"
-        return "no valid covariance" if judged else "covariances are judged only against ground truth, unaligned"
-    lacking = {"heading": "heading", "rotation": "attitude", "velocity": "velocity"}.get(score.partition("_")[0])
-    if lacking and score in SCORES:
-        return f"no {lacking} in the {'ground truth' if row['truth_kind'] == 'truth' else row['truth_kind']}"
-    return "not defined for this run"
+    if score.startswith("over_floor_"):
+        return missing.get(OVER[score.removeprefix("over_floor_")][1], "no floor of this output")
+    return missing.get(score.replace("anees_", "nees_"), "not defined for this run")
 
 
 # -- captions ---------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from ...datasets.errors import one_line
 from ...datasets.state import Array
 from ...datasets.trajectory import COVARIANCE, Trajectory
 from ..metrics import Alignment, Dims, ScoreError, align, associate
@@ -23,6 +24,7 @@ class Track(NamedTuple):
 
     Attributes:
         dims: "2d" where heights are not scored.
+        truth_kind: "truth", or what else the truth is.
     """
 
     label: str
@@ -31,16 +33,31 @@ class Track(NamedTuple):
     truth: Trajectory | None
     estimate: Trajectory
     dims: Dims = "3d"
+    truth_kind: str = "truth"
 
 
-def tracks_of(rows: Sequence[Record], folder: Path) -> tuple[list[Track], int | None]:
-    """Read the trajectories of a log's first seed that has any; return (tracks, seed)."""
+def tracks_of(rows: Sequence[Record], folder: Path, missing: list[str] | None = None) -> tuple[list[Track], int | None]:
+    """Read the trajectories of a log's first seed that has any; return (tracks, seed).
+
+    A file that cannot be read, as a truncated one, is a sentence added to `missing`; without it, an error.
+    """
     saved = [row for row in rows if row["trajectory"] is not None and (folder / row["trajectory"]).is_file()]
     if not saved:
         return [], None
     seed = min((row["seed"] for row in saved if row["seed"] is not None), default=None)
-    tracks = [_track(row, folder) for row in saved if row["seed"] == seed]
+    tracks = [_readable(row, folder, missing) for row in saved if row["seed"] == seed]
     return [track for track in tracks if track is not None], seed
+
+
+def _readable(row: Record, folder: Path, missing: list[str] | None) -> Track | None:
+    """Return the track of a row; None where it has no score, or cannot be read."""
+    try:
+        return _track(row, folder)
+    except (OSError, ValueError, KeyError) as error:  # a truncated file, or not one of ours
+        if missing is None:
+            raise
+        missing.append(f"{row['trajectory']}: {one_line(error)}")
+        return None
 
 
 def _track(row: Record, folder: Path) -> Track | None:
@@ -51,7 +68,7 @@ def _track(row: Record, folder: Path) -> Track | None:
     try:
         truth, estimate = associate(load_trajectory(folder / truth), estimate)
         aligned = align(truth, estimate, row["align"])
-        return Track(row["label"], row["output"], row["align"], truth, aligned, row["dims"])
+        return Track(row["label"], row["output"], row["align"], truth, aligned, row["dims"], row["truth_kind"])
     except ScoreError:  # it has no score either
         return None
 

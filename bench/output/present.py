@@ -98,7 +98,11 @@ def _draw_figures(rows: pd.DataFrame, folder: Path, differences: list[Record]) -
         def tell(done: int, total: int) -> None:
             status.update(f"drawing figures: {done} of {total}")
 
-        return len(draw_figures(rows, folder, differences, tell))
+        missing: list[str] = []
+        files = draw_figures(rows, folder, differences, tell, missing)
+    for sentence in missing:
+        say(f"{folder}: {sentence}")
+    return len(files)
 
 
 def _write_report(rows: pd.DataFrame, plan: Experiment, folder: Path, differences: list[Record]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from ..results.summary import OUTLIERS, Record, groups
 from .cells import (
     ABSENT,
     ACCURACY,
+    KNOWN,
     NEES_NOTE,
     ONLINE,
     Cell,
@@ -38,6 +39,19 @@ SHORT = {"position": "pos", "attitude": "att", "velocity": "vel", "biases": "bia
 
 SHOWN_OF_IDENTITY = 8
 """Letters of a run's identity that a table shows: enough to tell millions of runs apart."""
+
+
+UNITS = {column.unit for column in KNOWN.values()}
+
+MOST_LISTED = 4
+"""Names that a sentence lists; with their commas they fill half a line of 80 columns."""
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return different names, the first few of them, with commas: "a, b, c, d and 3 more"."""
+    each = list(dict.fromkeys(names))
+    more = f" and {len(each) - MOST_LISTED} more" if len(each) > MOST_LISTED else ""
+    return ", ".join(each[:MOST_LISTED]) + more
 
 
 class Line(NamedTuple):
@@ -79,9 +93,24 @@ class Sheet:
 
     @property
     def notes(self) -> list[str]:
-        """The note, and why cells are empty."""
-        why = dict.fromkeys(cell.why for line in self.lines for cell in line.cells if cell.why)
-        return [*self.note, *([f"{ABSENT}: {'; '.join(why)}"] if why else [])]
+        """The note, and a line for each reason why cells are empty: of which columns, and of whom if not of all."""
+        return [*self.note, *(f"{ABSENT} {text}" for text in self.reasons)]
+
+    @property
+    def reasons(self) -> list[str]:
+        """Why cells are empty: "NEES: no ground truth", "heading, drift (eskf): no run finished"."""
+        columns: dict[str, list[str]] = {}
+        names: dict[str, list[str]] = {}
+        for line in self.lines:
+            for heading, each in zip(self.headings[1:], line.cells, strict=True):
+                if each.why:
+                    columns.setdefault(each.why, []).append(_without_unit(heading))
+                    names.setdefault(each.why, []).append(line.name)
+        every = {line.name for line in self.lines}
+        return [
+            f"{listed(columns[why])}{f' ({listed(names[why])})' if {*names[why]} < every else ''}: {why}"
+            for why in columns
+        ]
 
     def by_output(self) -> dict[str, list[Line]]:
         """Return the lines by section and output, the least lag first: only outputs of equal lag are ranked."""
@@ -95,6 +124,12 @@ class Sheet:
         for line in sorted(self.lines, key=place):
             found.setdefault(", ".join(filter(None, (line.section, line.output))), []).append(line)
         return found
+
+
+def _without_unit(heading: str) -> str:
+    """Return a heading on one line, without its unit."""
+    name, _, below = heading.partition("\n")
+    return name if below in UNITS else f"{name} {below}".rstrip()
 
 
 def _line(row: Record, cells: list[Cell], **other: Any) -> Line:
@@ -217,11 +252,14 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
 def late_or_out(summary: Sequence[Record]) -> Sheet | None:
     """Return what became of late readings and outliers; None where there were none."""
     outliers = [name for name in summary[0] if name.startswith(OUTLIERS)]
-    counts = {"readings": "readings", "late_used": "late,\nused", "late_dropped": "late,\ndropped"}
+    counts = {"readings": "readings", "late": "late", "late_dropped": "late,\ndropped"}
     counts |= {"carried": "carried"} | {name: f"outliers\n{name.removeprefix(OUTLIERS)}" for name in outliers}
-    if not any(row[name] for row in summary for name in ("late_used", "late_dropped", *outliers)):
+    if not any(row[name] for row in summary for name in ("late", "late_dropped", *outliers)):
         return None
-    note = ["counts over all runs; carried: tied to the keyframe before by the IMU"]
+    note = [
+        "counts over all runs; late: received more than 1 ms after they were true; carried: tied by the IMU to the "
+        "keyframe before"
+    ]
     if outliers:
         note.append(
             "outliers: rejected by a filter's gate, or beyond the width of a loss; of Gaussian readings Huber's has "
@@ -308,16 +346,24 @@ def _difference(row: Record) -> Line:
         cells = [
             Cell(text(row["baseline"]), row["baseline"]),
             Cell(signed(row["difference"]), row["difference"]),
-            Cell(interval(row["low"], row["high"], signed) or ABSENT, row["low"]),
-            Cell(percent(row["ratio"]), row["ratio"]),
-            Cell(ABSENT if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p),
-            Cell(ABSENT if r is None else f"{r:+.2f}", r),
+            _or_absent(interval(row["low"], row["high"], signed), row["low"], f"intervals need {FEWEST_SEEDS} seeds"),
+            _or_absent(percent(row["ratio"]), row["ratio"], "a ratio needs numbers above zero"),
+            _or_absent("" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p, NO_TEST),
+            _or_absent("" if r is None else f"{r:+.2f}", r, NO_TEST),
         ]
         output = output_and_lag(row["output"], seen)
         output += "" if lag(seen) == lag(other) else f", against lag {lag(other)}"
     else:
         cells, output = [Cell(ABSENT, why="no seed that both finished")] * 6, "no seed that both finished"
     return Line(variant(row), [*cells, seeds], output, both, seen, column(row["score"]).raw)
+
+
+NO_TEST = f"no test: it needs {FEWEST_SEEDS} seeds of a simulated log that both finished"
+
+
+def _or_absent(shown: str, value: float | None, why: str) -> Cell:
+    """Return the cell of a number, or of none with the reason."""
+    return Cell(ABSENT, why=why) if value is None else Cell(shown, value)
 
 
 def _paired_note(paired: Sequence[Record]) -> list[str]:

@@ -48,7 +48,8 @@ ORIGIN = {
     "estimator": "TEXT",
     "spec": "TEXT",  # JSON
     "counts": "TEXT",  # JSON
-    "notes": "TEXT",  # JSON
+    "notes": "TEXT",  # JSON: a list, see `datasets.notes.as_data`
+    "missing": "TEXT",  # JSON: why scores are not there, {reason: [score, ...]}
     "trajectory": "TEXT",  # file under trajectories/
     "truth_trajectory": "TEXT",  # likewise, at the same times
     "started": "TEXT",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from itertools import count
 from statistics import fmean, median
 from typing import Any, TypeAlias
@@ -26,16 +27,14 @@ SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
 SEEDS_ENOUGH = 5
 """With fewer seeds the interval of ANEES is too wide to be useful, so only NIS, if requested, is tabulated."""
 
-COUNTS = {
-    "readings": ("readings",),
-    "late_used": ("late_used", "replayed"),  # by a smoother, by a filter that rewinds
-    "late_dropped": ("late",),
-    "carried": ("carried",),
-}
-"""Counts of readings that were late or between keyframes; summed over seeds."""
+COUNTS = {"readings": "readings", "late": "readings_late", "late_dropped": "late", "carried": "carried"}
+"""Counts of readings that were late or between keyframes, by their names in a run; summed over seeds."""
 
 UNFINISHED = ("diverged", "failed", "absent")
 """How a run ends that does not finish."""
+
+LONGEST_NAME = 100
+"""Letters of a log's name in the name of a file, which has 255 at most, with what it is added to."""
 
 OUTLIERS = "outliers_"
 """Prefix of the counts of readings that an estimator rejected, or gave less weight, as outliers."""
@@ -60,7 +59,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     """Return for each name one that files and LaTeX labels can have; no two differ only in capitals."""
     found: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)
+        stem = re.sub(r"[^A-Za-z0-9.=+-]+", "_", name)[:LONGEST_NAME]
         taken = {other.lower() for other in found.values()}
         numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
         found[name] = next(one for one in numbered if one.lower() not in taken)
@@ -73,14 +72,15 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
     Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES and coverage are means;
     costs are medians. `done` of `runs` are pooled; `diverged`, `failed` and `absent` count the rest; where none is
     done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, per degree of freedom, with
-    the number of those times at which it lies above and below its interval. `start` lists where the priors came from.
+    the number of those times at which it lies above and below its interval. `start` lists where the priors came from,
+    `missing` says by a score's name why it is None.
     """
     every = records(rows)
     ends = {
         key: [run[0]["status"] for run in groups(of, "seed").values()]
         for key, of in groups(every, "log", "label").items()
     }
-    counted = COUNTS | {name: (name,) for name in _outliers(every)}
+    counted = COUNTS | {name: name for name in _outliers(every)}
     summary = []
     for (log, label, output), group in groups(every, "log", "label", "output").items():
         done = [row for row in group if row["status"] == "done"]
@@ -98,7 +98,8 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= _over_floor(done)
         record |= _consistency(done)
         counts = [json.loads(row["counts"] or "{}") for row in done]
-        record |= {name: sum(run.get(of, 0) for run in counts for of in each) for name, each in counted.items()}
+        record |= {name: sum(run.get(of, 0) for run in counts) for name, of in counted.items()}
+        record["missing"] = {name: why for name, why in _missing(done).items() if record.get(name) is None}
         summary.append(record)
     return summary
 
@@ -107,6 +108,25 @@ def _rpe_step(group: Sequence[Record]) -> Record:
     """Return the step of a group's RPE, from its spec; None where that is not known."""
     scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
     return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
+
+
+def _missing(done: Sequence[Record]) -> dict[str, str]:
+    """Return why scores are missing, by their name: the first reason that a run gives."""
+    found: dict[str, str] = {}
+    for row in done:
+        found = why_missing(row) | found
+    return found
+
+
+def why_missing(row: Record) -> dict[str, str]:
+    """Return by the name of each missing score why, from a row of a run."""
+    return {name: why for why, names in _reasons(row.get("missing") or "{}").items() for name in names}
+
+
+@lru_cache(maxsize=256)
+def _reasons(text: str) -> dict[str, list[str]]:
+    """Return the JSON of a row; the runs of a log mostly have the same."""
+    return json.loads(text)
 
 
 def _pooled(done: Sequence[Record], name: str, n: str) -> float | None:

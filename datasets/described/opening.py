@@ -28,8 +28,8 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
     """Open a log.
 
     Args:
-        name_or_folder: a catalog entry's name, or its recording's folder; or a folder with a log.yaml; or a description
-            file (.yaml), whose files lie in `data`, or next to it.
+        name_or_folder: a folder with a log.yaml, by its path or by its name in `data`; or a catalog entry's name, or
+            its recording's folder; or a description file (.yaml), whose files lie in `data`, or next to it.
         data: folder whose subfolders are the recordings; FATHOM_DATA when left out.
         repair: drop rows that are not finite or out of order, and count them in the log's notes, instead of an error.
 
@@ -40,14 +40,16 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
         DatasetError: anything else, naming what, where, and the nearest known name.
     """
     path = Path(name_or_folder)
-    root = data if data is not None else os.environ.get("FATHOM_DATA") or None
+    root = _recordings(data)
     try:
-        with also_in(None if root is None else Path(root)):
+        with also_in(root):
             if (path / "log.yaml").is_file():
                 return build_log(read_description(path / "log.yaml"), path, repair=repair)
             if path.suffix == ".yaml" and path.is_file():
                 folder = path.parent if data is None else Path(data)
                 return build_log(read_description(path), folder, repair=repair)
+            if root is not None and (root / path / "log.yaml").is_file():
+                return build_log(read_description(root / path / "log.yaml"), root / path, repair=repair)
             if str(name_or_folder) in catalog_names():
                 return _open_catalogued(str(name_or_folder), data, repair=repair)
             is_folder = path.is_dir()
@@ -63,14 +65,23 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
         )
     names = catalog_names()
     hint = nearest(str(name_or_folder), names)
-    raise DatasetError(f"{name_or_folder}: no such log{hint}; neither a folder nor a known name ({', '.join(names)})")
+    within = "" if root is None else f" nor a folder with a log.yaml in {root}"
+    raise DatasetError(
+        f"{name_or_folder}: no such log{hint}; neither a folder{within} nor a known name ({', '.join(names)})"
+    )
+
+
+def _recordings(data: str | Path | None) -> Path | None:
+    """Return the folder of recordings: `data`, else FATHOM_DATA; None where neither is set."""
+    root = data if data is not None else os.environ.get("FATHOM_DATA") or None
+    return None if root is None else Path(root)
 
 
 def _open_catalogued(name: str, data: str | Path | None, *, repair: bool) -> Log:
-    root = data if data is not None else os.environ.get("FATHOM_DATA") or None
+    root = _recordings(data)
     if root is None:
         raise RecordingNotFound(f"{name}: the folder of recordings is not set; use --data DIR or set FATHOM_DATA")
-    folder = Path(root) / name
+    folder = root / name
     if not folder.is_dir():
         whence = "--data" if data is not None else "FATHOM_DATA"
         raise RecordingNotFound(

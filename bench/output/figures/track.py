@@ -37,6 +37,7 @@ BOUND: dict[str, Any] = {"color": "black", "linewidth": 0.5, "linestyle": (0, (6
 def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> Figure:
     """Draw the tracks from above, equal axes; smoothed tracks are thin, with open markers."""
     truth = next((track.truth for track in tracks if track.truth is not None), None)
+    kind = next((track.truth_kind for track in tracks if track.truth is not None), "truth")
     near = [track.estimate.p_WB_W[:, :2] for track in tracks if is_near(track)]
     near += [truth.p_WB_W[:, :2]] if truth is not None else []
     inside = np.concatenate(near) if near else np.zeros((1, 2))
@@ -46,7 +47,7 @@ def draw_tracks(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
     if truth is not None:
         axes.plot(*truth.p_WB_W[:, :2].T, color="black", linewidth=2.4, alpha=0.35)
         axes.plot(*truth.p_WB_W[0, :2], marker="o", color="black", markersize=5, linestyle="none")
-        handles.append(Line2D([], [], color="black", linewidth=2.4, alpha=0.35, label="truth"))
+        handles.append(Line2D([], [], color="black", linewidth=2.4, alpha=0.35, label=kind))
         handles.append(Line2D([], [], color="black", marker="o", markersize=5, linestyle="none", label="start"))
     labels = list(looks)
     for track in tracks:

@@ -15,6 +15,7 @@
     const read = (each) => each && each.map(floats);
     return {
       truth: read(block.truth),
+      kind: block.kind,
       tracks: block.tracks.map((track) => ({
         ...track, t: floats(track.t), p: read(track.p), error: read(track.error), sigma: read(track.sigma),
       })),
@@ -54,13 +55,13 @@
 
   const DRAW = {
     tracks(section) {
-      const { truth, tracks } = chosen(section);
+      const { truth, kind, tracks } = chosen(section);
       const traces = tracks.map((track) => line(track, {
         x: track.p[0], y: track.p[1], customdata: track.t, hovertemplate: axes.of_track,
       }));
       if (truth) {
         const ink = colour("ink");
-        traces.unshift({ type: "scatter", mode: "lines", name: "truth", x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
+        traces.unshift({ type: "scatter", mode: "lines", name: plain(kind), x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
         traces.push({ type: "scatter", mode: "markers", name: "start", x: truth[0].slice(0, 1), y: truth[1].slice(0, 1), marker: { color: ink, size: 9 }, hoverinfo: "name" });
       }
       const layout = { xaxis: { title: { text: axes.east } }, yaxis: { title: { text: axes.north }, scaleanchor: "x" } };

@@ -18,7 +18,7 @@ from ...errors import ExperimentError
 from ...files import write_whole, writing
 from ...results.store import load_runs
 from ...results.summary import Record, groups, records, summarise
-from .. import cells, sheets
+from .. import cells, notices, sheets
 from ..remarks import mostly_outside, not_positive
 from . import curves, runs
 from .results import differences_of, in_order, kept_plan
@@ -126,6 +126,7 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         facts=runs.facts(every),
         failures=runs.failures(every),
+        noticed=notices.sheet(every),
         warnings=[*mostly_outside(every), *not_positive(summary), *_mixed(every), *_missing(drawn)],
         accuracy=[sheets.accuracy(of, done) for of in by_log.values()],
         over_floor=_there(map(sheets.over_floor, by_log.values())),

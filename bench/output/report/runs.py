@@ -36,8 +36,16 @@ def facts(rows: Sequence[Record]) -> list[tuple[str, str]]:
         ("seeds", spans(seeds) or "none: recorded logs only"),
         ("alignment", ", ".join(dict.fromkeys(str(row["align"]) for row in scored)) or "no ground truth"),
     ]
-    kinds = dict.fromkeys(row["truth_kind"] for row in scored)
-    return [*found, ("against", ", ".join(map(against, kinds)) or ABSENT)]
+    return [*found, ("against", _against(scored) or ABSENT)]
+
+
+def _against(scored: Sequence[Record]) -> str:
+    """Return what errors are taken against; where it is not the same for all logs, on how many logs which."""
+    kinds = groups(scored, "truth_kind")
+    if len(kinds) == 1:
+        return against(next(iter(kinds))[0])
+    logs = {kind: len(groups(of, "log")) for (kind,), of in kinds.items()}
+    return "; ".join(f"{against(kind)}: {n} log{'s' if n > 1 else ''}" for kind, n in logs.items())
 
 
 def failures(rows: Sequence[Record]) -> Sheet | None:

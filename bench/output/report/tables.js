@@ -52,7 +52,7 @@
       part("Made by", list({ commit, ...machine, ...versions })),
     ];
     const sentences = Array.isArray(notes) ? notes : Object.values(notes);
-    if (sentences.length) parts.splice(2, 0, part("Notes", element("ul", null, ...sentences.map((note) => element("li", String(note))))));
+    if (sentences.length) parts.splice(2, 0, part("Notes", element("ul", null, ...sentences.map((note) => element("li", note.kind === "about" ? note.text : `${note.kind}: ${note.text}`)))));
     return parts;
   }
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from pyarrow.parquet import read_metadata
 
-from ....datasets.errors import one_line
 from ....datasets.state import POSITION, Array
 from ...results.summary import Record, groups
 from ..estimates import Track, error_m, has_bounds, is_near, tracks_of
@@ -93,11 +92,7 @@ def _read(row: Record, folder: Path, missing: list[str]) -> Track | None:
         if name is not None and not (folder / name).is_file():
             missing.append(f"{name}: not there")
             return None
-    try:
-        tracks, _ = tracks_of([row], folder)
-    except (OSError, ValueError, KeyError) as error:  # a truncated file, or not one of ours
-        missing.append(f"{row['trajectory']}: {one_line(error)}")
-        return None
+    tracks, _ = tracks_of([row], folder, missing)
     return tracks[0] if tracks else None
 
 
@@ -108,6 +103,7 @@ def _block(tracks: Sequence[tuple[Record, Track]], every: int) -> dict[str, Any]
     longest = max(truths, key=len, default=None)
     return {
         "truth": None if longest is None else _coordinates(longest.p_WB_W[::every, :2]),
+        "kind": next((track.truth_kind for _, track in tracks if track.truth is not None), "truth"),
         "tracks": [
             {
                 **named(row),

@@ -18,8 +18,9 @@ from ...metrics.bootstrap import FEWEST_SEEDS
 from ...results.intervals import TABLED, summarise_with_intervals
 from ...results.step_time import machine_name
 from ...results.summary import UNFINISHED, Record, file_names, groups, records
+from .. import notices
 from ..cells import ACCURACY, NEES_NOTE, Column, digits, lag, scored_how, spans
-from ..sheets import NOT_COMPARABLE
+from ..sheets import NOT_COMPARABLE, accuracy
 from .latex_text import escape
 
 ABSENT = "--"
@@ -162,6 +163,8 @@ def _caption(summary: Sequence[Record], rows: Sequence[Record]) -> str:
         sentences.append(f"Costs on {' and '.join(machines)}")
     if _is_examined(rows):
         sentences.append(NOT_COMPARABLE)
+    sentences += notices.sentences(rows)
+    sentences += [f"No {reason}" for reason in accuracy(summary).reasons]
     sentences.append(
         "Bold: the best online and the best smoothed number, as printed, of estimators that finished every run;"
         " NEES is not ranked"

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from textwrap import fill
 
 import pandas as pd
 from rich.cells import cell_len
@@ -12,22 +15,26 @@ from rich.table import Table
 from rich.text import Text
 
 from ...files import write_csv
+from ...metrics.scoring import by_reason
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, groups, is_judged, records, summarise
 from ...results.summary import consistency as consistency_of
-from .. import sheets
+from .. import notices, sheets
 from ..cells import Cell
 from ..remarks import failures, mostly_outside, not_positive
 from . import terminal
 
+LETTERS = 80
+"""Longest line of what the runs noticed, also where there is more room: longer ones are hard to read."""
 ANY_WIDTH = 10_000
 """More letters than any table is wide; in less room rich gives the width after cutting."""
 
 
 def write_table(rows: pd.DataFrame, path: Path) -> None:
-    """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field."""
-    write_csv(pd.DataFrame(summarise_with_intervals(rows)), path)
+    """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field, and `missing` why."""
+    summary = [row | {"missing": json.dumps(by_reason(row["missing"]))} for row in summarise_with_intervals(rows)]
+    write_csv(pd.DataFrame(summary), path)
 
 
 def write_consistency(rows: pd.DataFrame, path: Path) -> None:
@@ -70,21 +77,27 @@ def print_differences(differences: Sequence[Record], console: Console) -> None:
 
 
 def print_remarks(rows: pd.DataFrame, console: Console) -> None:
-    """Print a line for each run that did not finish, and for results that are not to be trusted."""
+    """Print a line for each run that did not finish, for results not to be trusted, and for what the runs noticed."""
     every = records(rows)
     for line in failures(every) + mostly_outside(every) + not_positive(summarise(rows)):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
+    for line, routine in notices.lines(every):
+        told = fill(line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False)
+        console.print(told, style="dim" if routine else "yellow", highlight=False, markup=False, soft_wrap=True)
 
 
 def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> None:
     """Print a table; on a narrow console in parts, one below the other, so that no number is cut off."""
-    whose, columns = _whose(sheet), _columns(sheet)
+    whose, columns, title = _whose(sheet), _columns(sheet), sheet.title
+    each = (_width(_table(sheet, [*whose, column], console.width), console) for column in columns)
+    unfolded = console.width if max(each, default=0) <= console.width else 0
     while columns:
         fitting = len(columns)
-        while fitting > 1 and _width(_table(sheet, whose + columns[:fitting]), console) > console.width:
+        while fitting > 1 and _width(_table(sheet, whose + columns[:fitting], unfolded), console) > console.width:
             fitting -= 1
-        console.print(_table(sheet, whose + columns[:fitting]))
+        console.print(_table(sheet, whose + columns[:fitting], unfolded))
         columns = columns[fitting:]
+        sheet = replace(sheet, title=f"{title} (continued)" if title else "")
         if noted and not columns:
             console.print(Text("\n".join(sheet.notes), "table.caption"))
         console.print()
@@ -121,8 +134,8 @@ def _parts(cell: Cell, width: int) -> Iterator[str]:
         yield cell.interval
 
 
-def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
-    """Lay out some columns of a table, with the names before them, each name once."""
+def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]], width: int) -> Table:
+    """Lay out some columns of a table for a console of this width, with the names before them, each name once."""
     headings = [sheet.headings[0], *(column[0] for column in columns)]
     tall = any("\n" in heading for heading in headings)
     shown, above = [], ""
@@ -131,7 +144,7 @@ def _table(sheet: sheets.Sheet, columns: Sequence[Sequence[str]]) -> Table:
         shown.append(f"{'' if top == above else top}\n{below}" if tall else below)
         above = top
     names = [line.name for line in sheet.lines]
-    table = terminal.plain_table(shown[0], names, sheet.title)
+    table = terminal.plain_table(shown[0], names, sheet.title, width)
     for heading, (_, *texts) in zip(shown[1:], columns, strict=True):
         width = max(map(cell_len, (*heading.split("\n"), *texts)))
         table.add_column(heading, justify="right", no_wrap=True, min_width=width)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from rich import box
@@ -20,6 +20,8 @@ NAME_WIDTH = 14
 """The column of names has at least this many letters: narrower, names would be hard to read."""
 LONGEST_WORD = 32
 """Words of a name with more letters are folded: beside a longer one, 80 columns leave no room for two numbers."""
+NAME_SHARE = 0.4
+"""Of a console's width for names: the rest holds four or five numbers."""
 
 
 def console() -> Console:
@@ -48,9 +50,16 @@ class _PlainText:
             yield segment if segment.control else segment._replace(text=text)
 
 
-def plain_table(heading: str, names: Iterable[str], title: str | None = None) -> Table:
-    """Return a table without frames that has one column yet: of names, folded between words where there is no room."""
+def plain_table(heading: str, names: Sequence[str], title: str | None = None, width: int = 0) -> Table:
+    """Return a table without frames that has one column yet: of names, folded between words where there is no room.
+
+    Args:
+        heading, title: of the column, and of the table.
+        names: of the rows.
+        width: of the console. Names are not folded within NAME_SHARE of it.
+    """
     longest = max((cell_len(word) for name in names for word in name.split()), default=0)
+    whole = min(max(map(cell_len, names), default=0), int(NAME_SHARE * width))
     table = Table(
         title=None if title is None else Text(title, "table.title"),
         title_justify="left",
@@ -59,5 +68,5 @@ def plain_table(heading: str, names: Iterable[str], title: str | None = None) ->
         pad_edge=False,
         padding=(0, 1, 0, 0),
     )
-    table.add_column(heading, overflow="fold", min_width=max(NAME_WIDTH, min(longest, LONGEST_WORD)))
+    table.add_column(heading, overflow="fold", min_width=max(NAME_WIDTH, min(longest, LONGEST_WORD), whole))
     return table

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import closing
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -211,6 +212,33 @@ def test_score_prints_errors_with_their_alignment(tmp_path: Path) -> None:
     assert "alignment: se3" in out
     assert "no RPE: no pair of poses is 1.0 m apart" in out  # they are 0.6 m apart
     assert call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--unit", "feet")[0] == 2
+
+
+def test_score_says_how_many_poses_match_and_what_would_match_more(tmp_path: Path) -> None:
+    truth = circle()
+    files = {"truth": truth, "late": replace(truth, t_ns=truth.t_ns + 3 * 10**9)}
+    files["jitter"] = replace(truth, t_ns=truth.t_ns + np.where(np.arange(200) % 10 == 0, 0, 10**8))
+    files["elsewhere"] = replace(truth, t_ns=truth.t_ns + 10**15)
+    for name, trajectory in files.items():
+        trajectory.to_tum(tmp_path / f"{name}.tum")
+
+    def scored(name: str, *options: object) -> str:
+        code, out, err = call("score", tmp_path / "truth.tum", tmp_path / f"{name}.tum", *options)
+        assert max(map(len, out.splitlines()), default=0) <= 80
+        return f"{code} {' '.join((out + err).split())}"
+
+    assert "197 of 200 poses of the truth and of 200 of the estimate" in scored("late")
+    assert "with --offset-s -3.000 the ATE would be about" in scored("late")
+    late = scored("late", "--offset-s", "-3")
+    assert "200 of 200 poses" in late
+    assert "with --offset-s" not in late
+    assert "20 of 200 poses" in scored("jitter")
+    assert "few poses match: --tolerance-s 0.1 would match most of them" in scored("jitter")
+    assert "few poses" not in scored("jitter", "--tolerance-s", "0.11")
+    nothing = scored("elsewhere")
+    assert nothing.startswith("2 fathom: no two poses are within 0.01 s of each other")
+    assert "with --offset-s -1000000.000 both begin together" in nothing
+    assert "--offset-s must be within" in scored("late", "--offset-s", "nan")
 
 
 def test_a_choice_that_there_is_not_is_refused_without_pydantics_words() -> None:

@@ -54,7 +54,7 @@ def test_a_run_is_stored_with_its_start(tmp_path: Path, monkeypatch: pytest.Monk
     start = "given" if prior == "given" else "moving, heading unknown"
     assert rows["status"].tolist() == ["done"]
     assert rows["start"].tolist() == [start]
-    assert any("heading unknown" in note for note in json.loads(rows["notes"][0])) == (prior == "made")
+    assert any("heading unknown" in note["text"] for note in json.loads(rows["notes"][0])) == (prior == "made")
     write_table(rows, tmp_path / "table.csv")
     assert pd.read_csv(tmp_path / "table.csv")["start"].tolist() == [start]
 

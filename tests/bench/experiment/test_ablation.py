@@ -376,7 +376,7 @@ def test_only_what_was_asked_for_is_shown(folder: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(
         "fathom.bench.execution.sweep.run_all", lambda tasks, jobs: (bench.execute(task) for task in tasks)
     )
-    monkeypatch.setattr("fathom.bench.output.figures.figures.draw_figures", lambda rows, folder, differences, tell: [])
+    monkeypatch.setattr("fathom.bench.output.figures.figures.draw_figures", lambda *_: [])
     only = ["run", str(folder.parent / "small.yaml"), "--out", str(folder.parent), "--only", "l heard/eskf no gps"]
     result = CliRunner().invoke(app, only)
     assert result.exit_code == 0, result.output

@@ -170,9 +170,14 @@ def test_the_spec_of_a_recorded_run_knows_its_description_and_whether_it_was_rep
         ({"seeds": [2**63]}, ["seeds[0]", "less than"]),
         ({"scores": {"rpe_delta": 1.5, "rpe_unit": "frames"}}, ["scores", "whole in frames", "1.5"]),
         ({"scores": {"score_period_s": 1e-12}}, ["scores.score_period_s", "0.001"]),
-        ({"estimators": ["eskf"]}, ["estimators[0]", "expected keys", "baseline", "write {name: eskf}"]),
-        ({"logs": ["ictineu"]}, ["logs[0]", "expected keys", "write {log: ictineu}"]),
-        ({"estimators": "eskf"}, ["`estimators`: expected a list, found 'eskf'"]),
+        ({"estimators": ["esfk"]}, ["estimators[0]", "did you mean 'eskf'"]),
+        ({"estimators": 3}, ["`estimators`: expected a list, found 3"]),
+        ({"estimators": [3]}, ["estimators[0]", "expected keys", "baseline"]),
+        ({"scores": ["nsi"]}, ["`scores`: no score 'nsi'", "did you mean 'nis'"]),
+        ({"scores": [3]}, ["`scores`: no score 3"]),
+        ({"scores": [{"align": "yaw"}, {"align": "none"}]}, ["`scores`: 'align' is there twice"]),
+        ({"logs": [SHORT | {"name": "a\ud800"}]}, ["'a\\ud800' has a character that is no text"]),
+        ({"scores": {1: 2}}, ["`scores[1]`", "expected text as a key"]),
         ({"seeds": [1.5]}, ["`seeds[0]`: expected a whole number, found 1.5"]),
         ({"scores": 3}, ["`scores`: expected keys and values (", "nees_epochs"]),
         ({"scores": {"nis": "maybe"}}, ["`scores.nis`: expected true or false, found 'maybe'"]),
@@ -186,7 +191,7 @@ def test_the_spec_of_a_recorded_run_knows_its_description_and_whether_it_was_rep
         ({"scores": {"align": "jaw"}}, ["scores.align", "'jaw'", "yaw"]),
         ({"scores": {"rpe_detla": 1}}, ["scores.rpe_detla", "did you mean 'rpe_delta'"]),
         ({"timeout_s": 0}, ["timeout_s"]),
-        ({"name": "../up"}, ["name"]),
+        ({"name": "../up"}, ["`name`: expected text that matches"]),
     ],
 )
 def test_a_wrong_key_or_value_is_named_with_its_place_and_neighbour(changes: dict[str, Any], says: list[str]) -> None:
@@ -195,6 +200,29 @@ def test_a_wrong_key_or_value_is_named_with_its_place_and_neighbour(changes: dic
     assert str(caught.value).startswith("t.yaml: ")
     for words in says:
         assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("short", "long"),
+    [
+        ({"estimators": ["eskf", "rts"]}, {"estimators": [{"name": "eskf"}, {"name": "rts"}]}),
+        ({"estimators": "eskf"}, {"estimators": [{"name": "eskf"}]}),
+        ({"estimators": {"name": "eskf"}}, {"estimators": [{"name": "eskf"}]}),
+        (
+            {"estimators": ["eskf", {"name": "eskf", "label": "b", "drop": ["gps"]}]},
+            {"estimators": [{"name": "eskf"}, {"name": "eskf", "label": "b", "drop": ["gps"]}]},
+        ),
+        ({"logs": ["box", "a/folder"]}, {"logs": [{"scenario": {"mission": "box"}}, {"log": "a/folder"}]}),
+        ({"logs": "ictineu_stpere_2004"}, {"logs": [{"log": "ictineu_stpere_2004"}]}),
+        ({"scores": ["nis", {"align": "yaw"}, "ate_rmse_m"]}, {"scores": {"nis": True, "align": "yaw"}}),
+        ({"scores": "floor"}, {"scores": {"floor": True}}),
+        ({"scores": ["nis_dvl", "nis"]}, {"scores": {"nis": True}}),
+        ({"compare": "drms_m"}, {"compare": ["drms_m"]}),
+        ({"tune": {"train": "box", "held_out": "box/2"}}, {"tune": {"train": ["box"], "held_out": ["box/2"]}}),
+    ],
+)
+def test_a_name_alone_is_an_entry(short: dict[str, Any], long: dict[str, Any]) -> None:
+    assert experiment(**short) == experiment(**long)
 
 
 def test_one_mistake_is_one_complaint() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import matplotlib.image
@@ -14,7 +15,7 @@ from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics import ScoreError
 from fathom.bench.metrics.floor import floors
-from fathom.bench.metrics.floor_ratio import OVER
+from fathom.bench.metrics.floor_ratio import FLOORS, OVER
 from fathom.bench.output.figures.figures import draw_figures
 from fathom.bench.output.tables.table import print_table
 from fathom.bench.results.store import COLUMNS
@@ -101,7 +102,7 @@ def test_a_floor_that_cannot_be_found_leaves_the_run_its_scores(folder: Path, mo
     row, *_ = bench.execute(Task.of(plan, plan.runs()[0])).rows
     assert row["status"] == "done"
     assert row["ate_rmse_m"] > 0
-    assert "no such look-ahead" in row["notes"]
+    assert json.loads(row["missing"])["floor: no such look-ahead"] == list(FLOORS)
 
 
 @pytest.mark.parametrize("lag_s", [1.0, 2.0])

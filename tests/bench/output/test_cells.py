@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
 from pathlib import Path
 
 import pytest
 from fathom.bench.output import cells, sheets
+from fathom.bench.output.report import runs
 from fathom.bench.output.tables.table import print_sheet
 from rich.console import Console
 
@@ -60,8 +62,17 @@ def test_an_output_is_named_by_name_and_lag(output: str, lookahead_s: float | No
     assert cells.output_and_lag(output, lookahead_s) == written
 
 
-RUN = {"status": "done", "truth_kind": "truth", "align": "none", "ate_rmse_m": None, "nees_position": None, "x": None}
-RUN |= {"heading_rmse_deg": None, "rotation_rmse_deg": None}
+RUN = {"status": "done", "ate_rmse_m": None, "heading_rmse_deg": None, "anees_position": None, "nis_dvl": None}
+RUN |= {"over_floor_position": None, "x": None}
+RUN |= {
+    "missing": json.dumps(
+        {
+            "no attitude in the reference": ["heading_rmse_deg", "rotation_rmse_deg"],
+            "no covariance": ["nees_position"],
+            "no floor": ["floor_position_m"],
+        }
+    )
+}
 
 
 @pytest.mark.parametrize(
@@ -69,13 +80,13 @@ RUN |= {"heading_rmse_deg": None, "rotation_rmse_deg": None}
     [
         ("ate_rmse_m", {"status": "failed"}, "no run finished"),
         ("ate_rmse_m", {"done": 0}, "no run finished"),
-        ("ate_rmse_m", {"truth_kind": None}, "no ground truth"),
-        ("nees_position", {}, "no valid covariance"),
-        ("nees_position", {"truth_kind": "reference"}, "covariances are judged only against ground truth, unaligned"),
-        ("nees_position", {"align": "yaw"}, "covariances are judged only against ground truth, unaligned"),
-        ("heading_rmse_deg", {"truth_kind": "reference"}, "no heading in the reference"),
-        ("rotation_rmse_deg", {}, "no attitude in the ground truth"),
+        ("ate_rmse_m", {"done": 2, "missing": {"ate_rmse_m": "no ground truth"}}, "no ground truth"),
+        ("heading_rmse_deg", {}, "no attitude in the reference"),
+        ("anees_position", {}, "no covariance"),
+        ("over_floor_position", {}, "no floor"),
+        ("nis_dvl", {}, "no innovations (smoothed, or no reading in time)"),
         ("x", {}, "not defined for this run"),
+        ("x", {"missing": None}, "not defined for this run"),
     ],
 )
 def test_a_dash_has_its_reason(score: str, row: dict[str, object], why: str) -> None:
@@ -110,8 +121,17 @@ def test_no_number_is_cut_however_narrow_the_terminal_is(width: int) -> None:
     for cell in sheet().lines[0].cells:
         assert printed.count(f"{cell.text} {cell.interval}") == 2
     assert "…" not in printed
-    assert printed.count("–: no ground truth") == 1
-    assert (printed.count("title") > 1) == (width < 200)
+    assert (
+        " ".join(printed.split()).count("– error, drift (an estimator with a name that goes on): no ground truth") == 1
+    )
+    assert (printed.count("title (continued)") > 0) == (printed.count("title") > 1) == (width < 200)
+
+
+def test_a_name_is_not_folded_where_80_columns_have_room_for_it() -> None:
+    console = Console(width=80, record=True)
+    name = "fls preintegrated lag 10"
+    print_sheet(sheets.Sheet("t", [], HEADINGS, [sheets.Line(name, [cells.Cell("12,345.67")] * 6)]), console)
+    assert console.export_text().count(name) == 2
 
 
 def test_a_name_is_not_folded_inside_a_word() -> None:
@@ -138,3 +158,12 @@ def test_the_pages_script_formats_no_number() -> None:
         text = script.read_text(encoding="utf-8")
         found = re.findall(r"toFixed|toPrecision|toLocaleString|NumberFormat|%\{[xy]|hindsight|\(m\)|, m\b", text)
         assert not found, script.name
+
+
+def test_the_report_says_how_many_logs_are_scored_against_what() -> None:
+    row = {"label": "eskf", "seed": None, "status": "done", "align": "none", "output": "online"}
+    rows = [
+        row | {"log": log, "truth_kind": kind} for log, kind in zip("abc", ["truth", "reference", "truth"], strict=True)
+    ]
+    assert dict(runs.facts(rows[:1]))["against"] == "ground truth"
+    assert dict(runs.facts(rows))["against"] == "ground truth: 2 logs; a reference, which is not ground truth: 1 log"

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -22,7 +23,7 @@ from fathom.bench.output.figures.step_time import draw_step_times
 from fathom.bench.output.figures.track import draw_errors, draw_tracks, pages_of
 from fathom.bench.output.tables.table import print_table, write_consistency, write_table
 from fathom.bench.results.store import COLUMNS
-from fathom.bench.results.summary import records, summarise
+from fathom.bench.results.summary import file_names, records, summarise
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
@@ -437,6 +438,48 @@ def test_where_nothing_came_to_its_end_nothing_is_drawn(
     rows: pd.DataFrame, tmp_path: Path, lost: dict[str, str | None]
 ) -> None:
     assert draw_figures(rows.assign(**lost), tmp_path) == []
+
+
+def test_a_damaged_trajectory_is_a_sentence_and_the_others_are_drawn(
+    rows: pd.DataFrame, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(folder / "trajectories", tmp_path / "trajectories")
+    (tmp_path / "trajectories" / "cut.parquet").write_bytes(b"PAR1 and no more")
+    damaged = rows.assign(trajectory=rows["trajectory"].mask(rows["label"] == "eskf", "cut.parquet"))
+    missing: list[str] = []
+    files = {path.stem for path in draw_figures(damaged, tmp_path, missing=missing)}
+    assert {"lawnmower-tactical-tracks", "lawnmower-tactical-errors"} <= files
+    (sentence,) = missing
+    assert sentence.startswith("cut.parquet: ArrowInvalid")
+
+
+def test_a_figure_that_cannot_be_drawn_is_a_sentence_and_the_others_are_drawn(
+    rows: pd.DataFrame, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> Figure:
+        raise ZeroDivisionError("nothing to divide by")
+
+    monkeypatch.setattr("fathom.bench.output.figures.figures.draw_step_times", refuse)
+    shutil.copytree(folder / "trajectories", tmp_path / "trajectories")
+    missing: list[str] = []
+    files = {path.stem for path in draw_figures(rows, tmp_path, missing=missing)}
+    assert {"lawnmower-tactical-tracks", "accuracy-cost"} <= files
+    assert "lawnmower-tactical-step-times" not in files
+    assert missing == ["figure lawnmower-tactical-step-times cannot be drawn (ZeroDivisionError: nothing to divide by)"]
+
+
+def test_the_legend_says_what_the_estimates_are_compared_with(rows: pd.DataFrame, folder: Path) -> None:
+    tracks, _ = tracks_of(records(rows.assign(truth_kind="reference")), folder / "trajectories")
+    figure = draw_tracks(tracks, looks_of(LABELS), "x")
+    words = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert "reference" in words
+    assert "truth" not in words
+
+
+def test_a_long_name_has_a_file_name_of_its_own() -> None:
+    names = file_names(["x" * 300, "x" * 301, "相模湾" * 90])
+    assert len({name.lower() for name in names.values()}) == 3
+    assert max(len(name.encode()) for name in names.values()) < 120
 
 
 def test_without_a_truth_there_are_tracks_and_step_times_alone(rows: pd.DataFrame, folder: Path) -> None:

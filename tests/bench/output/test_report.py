@@ -310,13 +310,16 @@ HOSTILE = """</script><script>alert("x")</script><img src=x onerror=alert(1)><a 
 
 def test_hostile_text_is_inert(rows: pd.DataFrame, folder: Path, browser: Any, tmp_path: Path) -> None:
     spec = json.dumps({"estimator": {"name": HOSTILE}, HOSTILE: 1})
+    notes, tame_notes = (
+        json.dumps([{"kind": kind, "text": text} for kind in ("damage", "about")]) for text in (HOSTILE, "cut off")
+    )
     bad = rows.assign(
-        log=HOSTILE, experiment=HOSTILE, notes=json.dumps([HOSTILE]), counts=json.dumps({HOSTILE: 3}), spec=spec,
+        log=HOSTILE, experiment=HOSTILE, notes=notes, counts=json.dumps({HOSTILE: 3}), spec=spec,
         machine=json.dumps({"cpu": HOSTILE}), start=HOSTILE, identity=HOSTILE, truth_kind=HOSTILE,
         label=rows["label"] + HOSTILE, cause=rows["cause"].mask(rows["cause"].notna(), HOSTILE),
     )  # fmt: skip
     known = differences_of(folder)
-    tame = page_of(rows, folder, tmp_path / "tame", known)
+    tame = page_of(rows.assign(notes=tame_notes), folder, tmp_path / "tame", known)
     differences = [{**row, "label": HOSTILE, "baseline_label": HOSTILE} for row in known]
     count = """["script", "img", "a", "iframe"].map((kind) => document.body.querySelectorAll(kind).length)"""
     elements = []

@@ -659,6 +659,24 @@ def test_errors_of_the_rig_and_the_imu_name_the_log(folder):
     assert str(error.value).startswith(f"{folder}: imu: 1 samples")
 
 
+def test_a_log_is_found_by_its_name_in_the_folder_of_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    t_ns = np.arange(1, 5) * 10**7
+    imu = ImuStream(t_ns, np.zeros((4, 3)), np.zeros((4, 3)))
+    write_folder(Log("mine", Rig(ImuNoise(**NOISE)), imu), tmp_path / "data" / "mine")
+    monkeypatch.delenv("FATHOM_DATA", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert np.array_equal(open_log("mine", tmp_path / "data").imu.t_ns, t_ns)
+    assert np.array_equal(open_log("mine", "data").imu.t_ns, t_ns)
+    with pytest.raises(DatasetError, match="mine: no such log; neither a folder nor a known name"):
+        open_log("mine")
+    monkeypatch.setenv("FATHOM_DATA", str(tmp_path / "data"))
+    assert open_log("mine").name == "mine"
+    with pytest.raises(DatasetError, match=r"nor a folder with a log\.yaml in .*data nor a known name"):
+        open_log("mien")
+
+
 @pytest.mark.slow
 @FUZZ
 @given(data=st.data(), repair=st.booleans())

@@ -1,0 +1,64 @@
+"""What a run notices of its log is a note with counts; "late" is one number for every estimator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from fathom.bench import run_log
+from fathom.bench.execution.noticed import late_readings, noticed
+from fathom.datasets import Scenario, simulate
+from fathom.datasets.log import Log
+from fathom.datasets.notes import Note, as_data
+from fathom.estimators import create
+
+COUNTS = {"readings": 0, "readings_late": 0, "readings_void": 0, "imu_gaps_bridged": 0}
+
+
+def kinds(notes: tuple[str, ...]) -> dict[tuple[str, str], Note]:
+    return {(note.kind, note.stream): note for note in notes if isinstance(note, Note)}
+
+
+def dive(**gps: object) -> Log:
+    return simulate(Scenario.from_dict({"duration_s": 20.0, "gps": {"rate_hz": 2.0, **gps}}), seed=1)
+
+
+def test_a_sensor_without_one_reading_is_told() -> None:
+    log = dive()
+    assert log.gps is not None
+    gone = np.zeros(len(log.gps), bool)
+    mute = replace(
+        log.gps, t_ns=log.gps.t_ns[gone], received_ns=log.gps.received_ns[gone], z=log.gps.z[gone],
+        sigma=log.gps.sigma[gone],
+    )  # fmt: skip
+    assert list(kinds(noticed(replace(log, gps=mute), COUNTS))) == [("silent", "gps")]
+    assert not noticed(log, COUNTS)
+
+
+def test_readings_outside_the_imu_are_told_with_their_share() -> None:
+    log = dive()
+    half = len(log.imu.t_ns) // 2
+    imu = replace(log.imu, t_ns=log.imu.t_ns[:half], w_WI_I=log.imu.w_WI_I[:half], f_I=log.imu.f_I[:half])
+    note = kinds(noticed(replace(log, imu=imu), COUNTS))["outside", "dvl"]
+    assert note.of == len(log.streams["dvl"])
+    assert note.share is not None
+    assert 0.4 < note.share < 0.6
+
+
+def test_what_a_run_counts_is_told_worst_first() -> None:
+    counts = {"readings": 200, "readings_late": 12, "readings_void": 1, "imu_gaps_bridged": 2, "late": 5, "carried": 7}
+    notes = noticed(dive(), counts | {"outliers_gps": 3, "outliers_heading": 0, "merged": 0})
+    assert {note.kind: note.count for note in notes} == {
+        "gap": 2, "late_dropped": 5, "late": 12, "carried": 7, "void": 1, "gated": 3,
+    }  # fmt: skip
+    assert as_data(notes[1])["share"] == 5 / 200
+
+
+def test_late_readings_are_the_same_number_for_a_filter_and_a_smoother() -> None:
+    log = dive(delay_s=0.3, disorder_s=1.0)
+    expected = late_readings(log, {"gps"}, log.start_ns, int(log.imu.t_ns[-1]))
+    asked = (("eskf", {}), ("eskf", {"max_delay_s": 0.0}), ("dead-reckoning", {}), ("window", {"lag_s": 1.0}))
+    results = [run_log(log, create(name, **options)) for name, options in asked]
+    assert expected > 10
+    assert [result.counts["readings_late"] for result in results] == [expected] * 4
+    assert [result.counts.get("late", 0) for result in results[:2]] == [0, expected]
