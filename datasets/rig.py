@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .errors import DatasetError
+from .places import on_earth
 from .state import Array
 
 EARTH_RATE_RAD_S = 7.292115e-5
@@ -69,7 +70,7 @@ class Rig:
     def __post_init__(self) -> None:
         if not 9.7 < self.gravity < 9.9:
             raise DatasetError(f"rig: gravity must be in m/s² and positive, found {self.gravity}")
-        if self.latitude_deg is not None and not -90 <= self.latitude_deg <= 90:
+        if self.latitude_deg is not None and not on_earth(self.latitude_deg):
             raise DatasetError(f"rig: latitude_deg must lie between −90 and 90, found {self.latitude_deg}")
 
     @property

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 from pydantic.dataclasses import dataclass
 
 from ..errors import DatasetError, complaints, nearest
+from ..places import Latitude
 from ..quantities import STRICT, Finite, NotNegative, Positive
 from ..rig import ImuNoise, Mounting, Rig
 from ..state import Array
@@ -95,7 +96,7 @@ class Scenario:
     path_spacing_s: Positive | None = None  # between the knots of smoothing splines; None: through every pose
 
     # the world
-    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None  # where the Earth turns; None: it does not
+    latitude_deg: Latitude | None = None  # where the Earth turns; None: it does not
     seabed: SeabedSpec | None = None  # None: always within the DVL's range
     waves: WavesSpec | None = None  # they move every mission but a recorded one, which has its own in it
     tide: TideSpec | None = None

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import yaml
 from fathom.datasets import Belief, DatasetError, ImuNoise, Log, Mounting, NavState, Rig, Trajectory
-from fathom.datasets.described.conversion import _stray
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.opening import RecordingNotFound, catalog_names, open_log
+from fathom.datasets.described.order import stray
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream
 from hypothesis import given
 from hypothesis import strategies as st
@@ -310,7 +310,10 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"streams.dvl.table.file": "dlv.csv"}, r"dlv.csv: no such file; did you mean 'dvl.csv'"),
     ({"streams.dvl.axes": "RFU"}, r"streams.dvl.axes.*'FLU' or 'FRD'.*RFU"),
     ({"streams.dvl.sigma_m_s": -1.0}, r"streams.dvl.sigma_m_s"),
-    ({"streams.dvl.sigma_m_s": None}, r"streams.dvl.*give one of `sigma_m_s` and `sigma`"),
+    (
+        {"streams.dvl.sigma_m_s": None},
+        r"streams.dvl.*give one of `sigma_m_s`, `sigma` \(columns\) and `variance` \(columns\)",
+    ),
     ({"streams.dvl.table.encoding": "utf-99"}, r"unknown encoding 'utf-99'"),
     ({"streams.dvl.time.unit": "min"}, r"streams.dvl.time.unit"),
     ({"streams.dvl.time.row_rate_hz": 5}, r"give one of `column` and `row_rate_hz`"),
@@ -364,7 +367,9 @@ def test_a_time_that_is_none_is_refused_or_repaired(folder, stamp):
 
 def test_text_among_numbers_is_named_with_its_row(folder):
     (folder / "depth.csv").write_text("counts\n20\nforty\n")
-    with pytest.raises(DatasetError, match=r"depth.csv: row 1: column 'counts' holds 'forty', not a number"):
+    with pytest.raises(
+        DatasetError, match=r"depth: row 1 \(1 in all\): column 'counts' holds 'forty', not a number; --repair"
+    ):
         open_log(folder)
 
 
@@ -619,7 +624,7 @@ def test_one_spike_in_time_costs_one_row(folder, row):
 @pytest.mark.parametrize("seed", range(20))
 def test_no_more_rows_are_dropped_for_order_than_must_be(seed):
     t_ns = np.random.default_rng(seed).integers(0, 9, 9)
-    left = t_ns[~_stray(t_ns)]
+    left = t_ns[~stray(t_ns)]
     assert (np.diff(left) > 0).all()
     runs = (c for k in range(len(left) + 1, 10) for c in itertools.combinations(t_ns.tolist(), k))
     assert not any(all(a < b for a, b in itertools.pairwise(run)) for run in runs)

@@ -133,9 +133,9 @@ def test_a_parquet_file_of_many_row_groups_reads_as_one(tmp_path, monkeypatch, r
                           "x": np.arange(n) * 0.1, "ok": np.arange(n) % 2 == 0, "other": ["z"] * n})  # fmt: skip
     frame.to_parquet(tmp_path / "a.parquet", row_group_size=5, index=False)
     read = read_table(tmp_path, Table(file="a.parquet"), ["x", "ok", "text"], ["ns", "when"])
-    assert read["ns"].dtype == read["when"].dtype == np.int64
+    assert read["ns"].dtype == np.int64
     np.testing.assert_array_equal(read["ns"], frame["ns"])
-    np.testing.assert_array_equal(read["when"], START * 10**9 + np.arange(n) * 10**9 + 1)
+    np.testing.assert_array_equal(times_ns(read["when"], "s")[0], START * 10**9 + np.arange(n) * 10**9 + 1)
     np.testing.assert_array_equal(read["x"], frame["x"])
     np.testing.assert_array_equal(read["ok"], [1.0, 0.0] * 11 + [1.0])
     np.testing.assert_array_equal(read["text"], [float(f"{i}.1") for i in range(n)])
@@ -278,7 +278,7 @@ def test_an_array_of_numbers_may_be_empty(arrays):
         (np.zeros(5, complex), r"v.npy: expected numbers in rows and columns, found"),
         (np.zeros(5, [("x", float)]), r"v.npy: expected numbers in rows and columns, found"),
         (np.array([{}] * 5, object), r"v.npy: cannot be read as an array"),
-        (np.zeros((4, 3)), r"the arrays must be of equal length, found \{'t': 5, 'v.0': 4"),
+        (np.zeros((4, 3)), r"the arrays must be of equal length, found \{'t': 5, 'v': 4"),
         (np.zeros((5, 2)), r"no column 'v.2'; did you mean 'v.[01]'\?; found t, v.0, v.1"),
         (np.zeros(5), r"no column 'v.0'; found t, v$"),
         (b"not an array", r"v.npy: cannot be read as an array"),
