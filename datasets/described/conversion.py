@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
 from ..files import regular_file
-from ..formats.columns import EXACT
+from ..formats.text_table import EXACT
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..rig import Rig
 from ..state import Array

@@ -16,8 +16,8 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_va
 
 from ..errors import DatasetError, complaints, nearest
 from ..files import regular_file
-from ..formats.columns import Column, Part, Table
 from ..formats.recording import Recording, loader
+from ..formats.table import Column, Part, Table
 from ..mounting import Matrix, MountingSpec
 from ..places import Latitude, Longitude
 from ..quantities import DEGREE, Finite, NotNegative, Positive, Vector
@@ -196,6 +196,12 @@ class Geodetic(Part):
     scale: Finite | tuple[Finite, Finite] = 1.0
     """Of latitude and longitude, before the unit; −1 turns a sign."""
     altitude: Height | None = None
+
+    @property
+    def signs_unsaid(self) -> bool:
+        """Whether the unit has no sign as NMEA writes it, and nothing else says the hemispheres."""
+        said = {"scale", "north_south", "east_west"} & self.model_fields_set
+        return self.unit in ("ddmm", "ddmmss") and not said
 
     @property
     def columns(self) -> tuple[Column, ...]:

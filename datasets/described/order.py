@@ -104,7 +104,7 @@ def disorder(t_ns: TimeArray, number: TimeArray, columns: list[NDArray[Any]]) ->
     shared[rows] = t_ns[match] == t_ns[rows]
     twins[rows] = shared[rows] & np.all([values[match] == values[rows] for values in columns], axis=0)
     lost = out & ~twins
-    return Disorder(twins, lost, _why(t_ns, number, lost, shared & lost))
+    return Disorder(twins, lost, _why(t_ns, number, lost))
 
 
 def complaint(t_ns: TimeArray, row: int) -> str:
@@ -115,24 +115,25 @@ def complaint(t_ns: TimeArray, row: int) -> str:
     return f"time {t_ns[row]} ns {how} the row above"
 
 
-def _why(t_ns: TimeArray, number: TimeArray, lost: NDArray[np.bool_], shared: NDArray[np.bool_]) -> str:
+def _why(t_ns: TimeArray, number: TimeArray, lost: NDArray[np.bool_]) -> str:
     """Return what the column of times seems to be; "" where rows are out of order by accident."""
     many = max(RUN_ROWS, RUN_SHARE * len(t_ns))
-    if np.count_nonzero(shared) >= many:
+    step_ns = np.diff(t_ns)
+    same = int(np.count_nonzero(lost[1:] & (step_ns == 0)))
+    if same >= many:
         return (
-            f"{np.count_nonzero(shared)} of {len(t_ns)} rows have other values under the stamp of a row above: "
-            "the stamps are too coarse (whole seconds?); name a finer column, or give `row_rate_hz`"
+            f"{same} have other values under the stamp of the row above; the stamps are too coarse (whole seconds?): "
+            "name a finer column, or give `row_rate_hz`"
         )
-    edges = np.flatnonzero(np.diff(lost & ~shared, prepend=False, append=False))
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
     pieces = edges[1::2] - edges[::2]
     if not len(pieces) or pieces.max() < many:
         return ""
-    step_ns = np.diff(t_ns)
     row = int(step_ns.argmin()) + 1
     back_s = -float(step_ns[row - 1]) * 1e-9
     period_s = next((period for period in COUNTERS_S if (1 - NEAR) * period <= back_s <= period), None)
     what = "was the clock set?" if period_s is None else f"a counter that wraps? `wraps_at_s: {period_s:.10g}`"
     return (
-        f"time goes back by {back_s:.6g} s at row {number[row]}: {what} (--repair drops single rows, not a piece of "
+        f"time goes back by {back_s:.6g} s at row {number[row]}; {what} (--repair drops single rows, not a piece of "
         f"{pieces.max()}; `from_s` and `until_s` cut a log)"
     )

@@ -57,6 +57,11 @@ def _locate(rows: Rows, part: d.Geodetic) -> None:
     latitude = _angle(rows, part.latitude, part.unit, float(scales[0]), "NS", part.north_south)
     longitude = _angle(rows, part.longitude, part.unit, float(scales[1]), "EW", part.east_west)
     rows.values |= {"latitude": latitude, "longitude": longitude}
+    if part.signs_unsaid and len(latitude) and not (latitude < 0).any() and not (longitude < 0).any():
+        rows.opening.notes.append(
+            f"{rows.stream}: all places are taken for north and east, since {part.unit} has no sign; `north_south` and "
+            "`east_west` name the columns of hemispheres, and `scale: [1, -1]` turns east to west"
+        )
     there = on_earth(np.degrees(latitude), np.degrees(longitude))
     zero = (latitude == 0) & (longitude == 0)
     nowhere = zero & _away_from_zero(latitude, longitude, there & ~zero)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..formats.columns import Columns, Flaws
+from ..formats.table import Columns, Flaws
 from ..state import LIMIT_NS, Array, TimeArray
 from ..times import times_ns
 from . import description as d
@@ -25,7 +25,10 @@ DAY_NS = 86_400 * 1_000_000_000
 """Nanoseconds per day."""
 REPEATED_SHARE = 0.5
 """A reading that changes repeats itself by chance in far fewer rows, in all of its components at once."""
+CHANGES = 5
+"""Readings that change less often are those of something that stands still."""
 COMMA = re.compile(r"[-+]?\d+,\d+")
+COMMA_HINT = "; `decimal: ','`?"
 
 
 @dataclass
@@ -137,8 +140,9 @@ class Rows:
         found = disorder(self.t_ns, self.number, columns)
         if found is not None:
             t_ns, twins = self.t_ns, int(np.count_nonzero(found.twins))
-            if found.why and np.count_nonzero(found.lost) <= LARGEST_SHARE * self.total:
-                raise self.error(found.why)
+            lost = int(np.count_nonzero(found.lost))
+            if found.why:
+                raise self.error(f"{lost} of {len(t_ns)} rows are out of order, too many to drop: {found.why}")
             self.total, self.dropped = self.total - twins, self.dropped - twins
             self.refuse(found.lost | found.twins, lambda row: complaint(t_ns, row), "out of order")
         self.settle()
@@ -179,7 +183,7 @@ def read_rows(
         _use_valid(rows, valid)
     rows.refuse(
         ~rows.timed,
-        lambda row: f"time is {', '.join(str(rows.raw[c][row]) for c in stamps) or 'beyond the clock'}",
+        lambda row: f"time is {_shown([rows.raw[column][row] for column in stamps])}",
         "without a time",
     )
     rows.refuse(far(rows.t_ns), lambda row: _far(rows.t_ns, row), "more than 400 days from the others")
@@ -249,6 +253,11 @@ def _use_valid(rows: Rows, valid: d.Valid) -> None:
     rows.leave_out(~good, "invalid")
 
 
+def _shown(stamps: Sequence[Any]) -> str:
+    comma = any(COMMA.fullmatch(str(stamp)) for stamp in stamps)
+    return (", ".join(map(str, stamps)) or "beyond the clock") + (COMMA_HINT if comma else "")
+
+
 def _number(text: str) -> float:
     try:
         return float(text)
@@ -261,7 +270,7 @@ def _no_number(rows: Rows, column: d.Column, row: int) -> str:
     word = rows.words.get(column, {}).get(int(rows.number[row]))
     if word is None:
         return f"column {column!r} is {rows.raw[column][row]}"
-    return f"column {column!r} holds {word!r}, not a number" + ("; `decimal: ','`?" if COMMA.fullmatch(word) else "")
+    return f"column {column!r} holds {word!r}, not a number" + (COMMA_HINT if COMMA.fullmatch(word) else "")
 
 
 def _far(t_ns: TimeArray, row: int) -> str:
@@ -298,7 +307,7 @@ def _without_repeats(rows: Rows, part: Any, columns: Sequence[d.Column]) -> None
     elif len(columns) > 1:
         zero = np.all([each == 0 for each in values if each.dtype.kind != "T"], axis=0)
         share = np.count_nonzero(again & ~zero) / len(again)
-        if share > REPEATED_SHARE:
+        if share > REPEATED_SHARE and np.count_nonzero(~again) > CHANGES:
             rows.opening.notes.append(
                 f"{rows.stream}: {share:.0%} of the rows have the values of the row before; if they were published "
                 "again, `drop_repeats: true` leaves them out"

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..formats.columns import Columns, Flaws, read_table
+from ..formats.columns import read_table
 from ..formats.recording import Recording, Wanted
+from ..formats.table import Columns, Flaws
 from ..state import Array, TimeArray
 from ..times import NS_PER
 from . import description as d

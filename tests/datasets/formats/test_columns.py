@@ -17,7 +17,9 @@ import pytest
 from fathom.datasets import DatasetError, Log, Trajectory
 from fathom.datasets.described.opening import CATALOG, open_log
 from fathom.datasets.formats import columns as module
-from fathom.datasets.formats.columns import Table, read_table
+from fathom.datasets.formats import text_table
+from fathom.datasets.formats.columns import read_table
+from fathom.datasets.formats.table import Table
 from fathom.datasets.times import times_ns
 from hypothesis import given
 from hypothesis import strategies as st
@@ -28,8 +30,9 @@ PIECES = pytest.mark.parametrize(("rows", "size"), [(1, 1), (2, 7), (3, 100), (1
 
 
 def pieces_of(monkeypatch: pytest.MonkeyPatch, rows: int, size: int) -> None:
-    monkeypatch.setattr(module, "PIECE_ROWS", rows)
-    monkeypatch.setattr(module, "PIECE_BYTES", size)
+    for each in (module, text_table):
+        monkeypatch.setattr(each, "PIECE_ROWS", rows)
+        monkeypatch.setattr(each, "PIECE_BYTES", size)
 
 
 def table(folder: Path, text: str, *columns: Any, times: Any = (), **form: Any) -> dict[Any, Any]:
@@ -163,7 +166,8 @@ MEASURE = """
 import resource, sys
 from pathlib import Path
 import numpy as np, pandas as pd
-from fathom.datasets.formats.columns import Table, read_table
+from fathom.datasets.formats.columns import read_table
+from fathom.datasets.formats.table import Table
 from fathom.datasets.times import times_ns
 folder, name = Path(sys.argv[1]), sys.argv[2]
 form = Table(file=name)

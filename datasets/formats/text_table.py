@@ -1,0 +1,171 @@
+"""Tables in text: lines split by a delimiter, read piece by piece."""
+
+from __future__ import annotations
+
+import codecs
+import io
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import pandas as pd
+
+from ..errors import DatasetError
+from .table import Column, Flaws, Table, check_columns
+
+EXACT: dict[str, Any] = (
+    {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
+)
+"""Makes pandas read the nearest float64 of the text; 3.1 does so by default (tested), and warns about the option."""
+
+PIECE_BYTES = 1 << 18
+"""Of text at a time; larger pieces were not faster, and cost memory."""
+PIECE_ROWS = 1 << 14
+"""Rows at a time, about as much."""
+PIECE_FIELDS = 1 << 20
+"""Fields at a time, so that the pieces of a table with very many columns stay small: 8 MB of numbers."""
+SEPARATOR = "\x1f"
+"""Put in the place of a delimiter of several letters; ASCII made it to separate fields, and texts do not hold it."""
+
+
+class _Lines(io.TextIOBase):
+    """A text file without its empty lines, comments and lines of other kinds, for pandas to read."""
+
+    def __init__(self, file: IO[str], table: Table, flaws: Flaws) -> None:
+        self.file, self.table, self.flaws, self.ahead = file, table, flaws, ""
+        self.separator, self.rows = separator_of(table), 0
+        self.kinds = () if table.lines is None else table.lines.values  # noqa: PD011  (our own field)
+
+    def _counts(self, line: str) -> bool:
+        comment = self.table.comment
+        return bool(line.strip()) and not (comment and line.startswith(comment))
+
+    def _is_row(self, line: str) -> bool:
+        kind = self.table.lines
+        if not self._counts(line):
+            return False
+        if kind is None:
+            self.rows += 1
+            return True
+        fields = line.split(None if self.table.delimiter == "whitespace" else self.table.delimiter, kind.field + 1)
+        if len(fields) > kind.field and fields[kind.field].strip().strip('"') in self.kinds:
+            self.rows += 1
+            return True
+        self.flaws.other_lines += 1
+        return False
+
+    def _separated(self, text: str) -> str:
+        return text.replace(self.table.delimiter, SEPARATOR) if self.separator == SEPARATOR else text
+
+    def header(self) -> str:
+        """Return the first line that is no comment; "" at the end."""
+        return self._separated(next(filter(self._counts, self.file), ""))
+
+    def first(self) -> str:
+        """Return the next line of data; "" at the end."""
+        return self._separated(next(filter(self._is_row, self.file), ""))
+
+    def read(self, size: int | None = -1) -> str:
+        """Return some whole lines of data; "" at the end."""
+        text, self.ahead = self.ahead, ""
+        while not text and (lines := self.file.readlines(PIECE_BYTES)):
+            text = self._separated("".join(filter(self._is_row, lines)))
+        return text
+
+
+def separator_of(table: Table) -> str:
+    """Return how pandas is told the delimiter; what it would take for a regular expression is replaced beforehand."""
+    if table.delimiter == "whitespace":
+        return r"\s+"
+    return table.delimiter if len(table.delimiter.encode()) == 1 else SEPARATOR
+
+
+def text_pieces(
+    path: Path, table: Table, wanted: Iterable[Column], texts: Collection[Column], flaws: Flaws
+) -> Iterator[pd.DataFrame]:
+    """Yield the rows of a file, piece by piece; see `columns.read_table`."""
+    try:
+        utf_8 = codecs.lookup(table.encoding).name == "utf-8"
+        with path.open(encoding="utf-8-sig" if utf_8 else table.encoding) as file:  # without its byte-order mark
+            yield from _frames(_Lines(file, table, flaws), path, table, wanted, texts)
+    except UnicodeDecodeError:
+        raise _undecoded(path, table.encoding) from None
+    except LookupError as error:
+        if isinstance(error, KeyError | IndexError):
+            raise
+        raise DatasetError(f"{path}: unknown encoding {table.encoding!r}") from None
+
+
+def _frames(
+    lines: _Lines, path: Path, table: Table, wanted: Iterable[Column], texts: Collection[Column]
+) -> Iterator[pd.DataFrame]:
+    """Yield the rows of a text table, columns by name; without a header, by index."""
+    separator, names = lines.separator, None
+    if table.header:
+        head = lines.header()
+        if not head:
+            raise DatasetError(f"{path}: no rows")
+        row = pd.read_csv(io.StringIO(head), sep=separator, header=None, dtype=str, keep_default_na=False).iloc[0]
+        names = [str(name).strip() for name in row]
+        check_columns(wanted, names, path)
+    lines.ahead = lines.first()
+    if not lines.ahead:
+        if names is None:
+            raise DatasetError(f"{path}: no rows")
+        yield pd.DataFrame({name: np.zeros(0) for name in names})
+        return
+    width = len(lines.ahead.split()) if separator == r"\s+" else lines.ahead.count(separator) + 1
+    reader: Any = pd.read_csv(
+        lines,
+        sep=separator,
+        header=None,
+        dtype={names.index(str(c)) if names else c: str for c in texts},
+        skipinitialspace=True,
+        index_col=False,
+        chunksize=max(1, min(PIECE_ROWS, PIECE_FIELDS // width)),
+        decimal=table.decimal,
+        on_bad_lines="error" if lines.flaws.too_long is None else "skip",
+        low_memory=False,
+        **EXACT,
+    )
+    rows = 0
+    with reader:
+        for frame in reader:
+            if names is None:
+                frame.columns = pd.Index([int(c) for c in frame.columns], dtype=object)
+                check_columns(wanted, list(frame.columns), path)
+            else:
+                if len(frame.columns) == len(names) + 1 and frame.iloc[:, -1].isna().all():
+                    frame = frame.iloc[:, :-1]  # every row ends in a delimiter
+                if len(frame.columns) != len(names):
+                    raise DatasetError(
+                        f"{path}: the header names {len(names)} columns, the rows have {len(frame.columns)}"
+                    )
+                frame.columns = pd.Index(names)
+            rows += len(frame)
+            yield frame
+    if lines.flaws.too_long is not None:
+        lines.flaws.too_long += lines.rows - rows
+
+
+def _undecoded(path: Path, encoding: str) -> DatasetError:
+    """Return the error for a file that is not in this encoding, with the first wrong byte."""
+    decoder = codecs.getincrementaldecoder(encoding)()
+    at, final = 0, False
+    with path.open("rb") as file:
+        start = file.read(2)
+        file.seek(0)
+        while not final:
+            chunk = file.read(PIECE_BYTES)
+            final = not chunk
+            try:
+                decoder.decode(chunk, final)
+            except UnicodeDecodeError as error:
+                at += (
+                    len(chunk) - len(error.object) + error.start
+                )  # its object begins with the bytes left over from before
+                break
+            at += len(chunk)
+    guess = "utf-16" if start in (b"\xff\xfe", b"\xfe\xff") else "latin-1"
+    return DatasetError(f"{path}: byte {at} is not {encoding}; set `encoding` ({guess}?)")
