@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..errors import DatasetError
 from ..files import regular_file
 from .parquet import check_size, unpacked
-from .table import Column, Columns, Flaws, Table, check_columns
+from .table import Column, Columns, Flaws, Table, check_columns, short
 from .text_table import PIECE_BYTES, PIECE_ROWS, text_pieces
 
 BOOLEANS = {"true": 1, "True": 1, "TRUE": 1, "false": 0, "False": 0, "FALSE": 0}
@@ -141,9 +141,11 @@ def _array(path: Path) -> NDArray[Any]:
 def _parquet_pieces(path: Path, wanted: Iterable[Column], texts: Collection[Column]) -> Iterator[pd.DataFrame]:
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path, buffer_size=PIECE_BYTES, pre_buffer=False) as file:
-        check_columns(wanted, file.schema_arrow.names, path)
-        names = [str(column) for column in wanted]
+    names = [str(column) for column in wanted]
+    schema = pq.read_schema(path)
+    check_columns(wanted, schema.names, path)
+    texts_in_it = [name for name in names if str(schema.field(name).type) in ("string", "large_string")]
+    with pq.ParquetFile(path, buffer_size=PIECE_BYTES, pre_buffer=False, read_dictionary=texts_in_it) as file:
         check_size(path, file, names)
         if not file.metadata.num_rows:
             yield pd.DataFrame({name: np.zeros(0) for name in names})
@@ -156,7 +158,7 @@ def _as_written(series: pd.Series, decimal: str) -> NDArray[Any]:
     values = series.to_numpy()
     if values.dtype.kind != "O":
         return values
-    texts = [value if absent else str(value) for value, absent in zip(values, series.isna(), strict=True)]
+    texts = [value if absent else short(value) for value, absent in zip(values, series.isna(), strict=True)]
     if decimal != ".":
         texts = [text.replace(decimal, ".") if isinstance(text, str) else text for text in texts]
     return np.array(texts, TEXT)
@@ -174,7 +176,7 @@ def _numbers(series: pd.Series, decimal: str) -> tuple[NDArray[Any], dict[int, s
         if absent[row]:
             continue
         try:
-            text = str(value) if decimal == "." else str(value).replace(decimal, ".")
+            text = short(value) if decimal == "." else short(value).replace(decimal, ".")
             numbers[row] = BOOLEANS[text] if text in BOOLEANS else float(text.replace("_", "?"))
         except ValueError:
             words[row] = str(value)[:LONGEST_WORD]

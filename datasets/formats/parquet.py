@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
+from .table import short
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -57,6 +58,9 @@ def unpacked(array: pa.Array[Any], *, as_written: bool) -> pd.Series | NDArray[A
         ints = array.cast(pa.int32()).cast(pa.int64()) if small else array.cast(pa.int64())
         unit_ns = (DAY_NS if pa.types.is_date32(kind) else NS_PER["ms"]) if is_date else NS_PER[kind.unit]
         return _ns(ints, unit_ns).view("datetime64[ns]" if since_when else "timedelta64[ns]")
+    if pa.types.is_dictionary(kind):
+        values = np.array([*map(short, array.dictionary.to_pylist()), None], object)
+        return values[array.indices.fill_null(len(values) - 1).to_numpy(zero_copy_only=False)]
     if as_written and pa.types.is_integer(kind) and array.null_count and not pa.types.is_uint64(kind):
         return _integers(array.cast(pa.int64()))
     return array.to_pandas()

@@ -12,6 +12,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..errors import DatasetError, nearest
 
+LONGEST_TEXT = 400
+"""Characters of a field, so that a Parquet file with one text of megabytes in every row needs little memory."""
 MEANT = {r"\s+": "whitespace", r"\s*": "whitespace", r"\t": '"\\t" in double quotes', " +": "whitespace"}
 """What is probably meant by these delimiters, which would be taken literally."""
 
@@ -92,3 +94,9 @@ def check_columns(wanted: Iterable[Column], found: Sequence[Column], path: Path)
         if column not in found:
             named = ", ".join(str(c) for c in found[:40])
             raise DatasetError(f"{path}: no column {column!r}{nearest(str(column), map(str, found))}; found {named}")
+
+
+def short(value: Any) -> str:
+    """Return a field as text; of one that is longer than any time, place or word, the beginning."""
+    text = str(value)
+    return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 1]}…"

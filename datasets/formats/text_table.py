@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import io
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
@@ -23,8 +24,8 @@ PIECE_BYTES = 1 << 18
 """Of text at a time; larger pieces were not faster, and cost memory."""
 PIECE_ROWS = 1 << 14
 """Rows at a time, about as much."""
-PIECE_FIELDS = 1 << 20
-"""Fields at a time, so that the pieces of a table with very many columns stay small: 8 MB of numbers."""
+WIDE = 500
+"""Of a table with more columns only the wanted ones are handed to pandas, which takes its time for every column."""
 SEPARATOR = "\x1f"
 """Put in the place of a delimiter of several letters; ASCII made it to separate fields, and texts do not hold it."""
 
@@ -35,6 +36,7 @@ class _Lines(io.TextIOBase):
     def __init__(self, file: IO[str], table: Table, flaws: Flaws) -> None:
         self.file, self.table, self.flaws, self.ahead = file, table, flaws, ""
         self.separator, self.rows = separator_of(table), 0
+        self.picked, self.width = list[int](), 0
         self.kinds = () if table.lines is None else table.lines.values  # noqa: PD011  (our own field)
 
     def _counts(self, line: str) -> bool:
@@ -68,10 +70,32 @@ class _Lines(io.TextIOBase):
 
     def read(self, size: int | None = -1) -> str:
         """Return some whole lines of data; "" at the end."""
-        text, self.ahead = self.ahead, ""
+        text, self.ahead = self._narrowed([self.ahead]), ""
         while not text and (lines := self.file.readlines(PIECE_BYTES)):
-            text = self._separated("".join(filter(self._is_row, lines)))
+            text = self._narrowed(map(self._separated, filter(self._is_row, lines)))
         return text
+
+    def fields(self, line: str) -> list[str]:
+        """Return the fields of a line."""
+        if self.separator == r"\s+":
+            return line.split()
+        return next(csv.reader([line], delimiter=self.separator, skipinitialspace=True), [])
+
+    def narrow(self, picked: list[int], width: int) -> None:
+        """Hand on these fields only, of lines that have `width`."""
+        self.picked, self.width = picked, width
+
+    def _narrowed(self, lines: Iterable[str]) -> str:
+        if not self.width:
+            return "".join(lines)
+        kept = []
+        for line in lines:
+            fields = self.fields(line)
+            if len(fields) == self.width:
+                kept.append(self.separator.replace(r"\s+", " ").join(fields[i] for i in self.picked) + "\n")
+            elif line and self.flaws.too_long is None:
+                raise ValueError(f"a line has {len(fields)} fields instead of {self.width}")
+        return "".join(kept)
 
 
 def separator_of(table: Table) -> str:
@@ -106,8 +130,7 @@ def _frames(
         head = lines.header()
         if not head:
             raise DatasetError(f"{path}: no rows")
-        row = pd.read_csv(io.StringIO(head), sep=separator, header=None, dtype=str, keep_default_na=False).iloc[0]
-        names = [str(name).strip() for name in row]
+        names = [name.strip() for name in lines.fields(head)]
         check_columns(wanted, names, path)
     lines.ahead = lines.first()
     if not lines.ahead:
@@ -115,15 +138,24 @@ def _frames(
             raise DatasetError(f"{path}: no rows")
         yield pd.DataFrame({name: np.zeros(0) for name in names})
         return
-    width = len(lines.ahead.split()) if separator == r"\s+" else lines.ahead.count(separator) + 1
+    columns: list[Column] = list(range(len(lines.fields(lines.ahead))))
+    if names is None:
+        check_columns(wanted, columns, path)
+    elif len(columns) not in (len(names), len(names) + 1):
+        raise DatasetError(f"{path}: the header names {len(names)} columns, the rows have {len(columns)}")
+    else:
+        columns = [*names, *columns[len(names) :]]
+    if len(columns) > WIDE:
+        lines.narrow([columns.index(column) for column in wanted], len(columns))
+        columns = list(wanted)
     reader: Any = pd.read_csv(
         lines,
         sep=separator,
         header=None,
-        dtype={names.index(str(c)) if names else c: str for c in texts},
+        dtype={columns.index(column): str for column in texts},
         skipinitialspace=True,
         index_col=False,
-        chunksize=max(1, min(PIECE_ROWS, PIECE_FIELDS // width)),
+        chunksize=PIECE_ROWS,
         decimal=table.decimal,
         on_bad_lines="error" if lines.flaws.too_long is None else "skip",
         low_memory=False,
@@ -132,17 +164,13 @@ def _frames(
     rows = 0
     with reader:
         for frame in reader:
-            if names is None:
-                frame.columns = pd.Index([int(c) for c in frame.columns], dtype=object)
-                check_columns(wanted, list(frame.columns), path)
-            else:
-                if len(frame.columns) == len(names) + 1 and frame.iloc[:, -1].isna().all():
-                    frame = frame.iloc[:, :-1]  # every row ends in a delimiter
-                if len(frame.columns) != len(names):
-                    raise DatasetError(
-                        f"{path}: the header names {len(names)} columns, the rows have {len(frame.columns)}"
-                    )
-                frame.columns = pd.Index(names)
+            if len(frame.columns) != len(columns) or (
+                names is not None and len(columns) > len(names) and not frame.iloc[:, -1].isna().all()
+            ):  # a field more than names is nothing, where every row ends in a delimiter
+                raise DatasetError(
+                    f"{path}: the header names {len(names or columns)} columns, the rows have {len(frame.columns)}"
+                )
+            frame.columns = pd.Index(columns, dtype=object)
             rows += len(frame)
             yield frame
     if lines.flaws.too_long is not None:
