@@ -7,15 +7,22 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import DatasetError
 from .rig import Rig
 from .state import Array, Belief, TimeArray
+from .times import far, far_complaint
 from .trajectory import Trajectory
 
 
+def is_noise(sigma: Array) -> NDArray[np.bool_]:
+    """Return (n,): whether all of a row's standard deviations (n, m) are positive."""
+    return (sigma > 0).all(axis=1)
+
+
 def check_rows(stream: str, t_ns: TimeArray, columns: Mapping[str, Array], *, strict: bool) -> None:
-    """Refuse times out of order and values that are not finite.
+    """Refuse times out of order, or far from all others, and values that are not finite.
 
     Args:
         stream: name used in the error.
@@ -31,17 +38,16 @@ def check_rows(stream: str, t_ns: TimeArray, columns: Mapping[str, Array], *, st
             raise DatasetError(f"{stream}: {len(t_ns)} times but {len(values)} rows of {name}")
         bad = np.flatnonzero(~np.isfinite(np.asarray(values).reshape(len(t_ns), -1)).all(axis=1)) if len(t_ns) else []
         if len(bad):
-            raise DatasetError(
-                f"{stream}: row {bad[0]} ({len(bad)} in all): {name} is {values[bad[0]]}; --repair drops such rows"
-            )
+            raise DatasetError(f"{stream}: row {bad[0]} ({len(bad)} in all): {name} is {values[bad[0]]}")
     step = np.diff(t_ns)
     bad = np.flatnonzero(step <= 0 if strict else step < 0)
     if len(bad):
         row = int(bad[0]) + 1
         how = "repeats" if step[row - 1] == 0 else "comes before"
-        raise DatasetError(
-            f"{stream}: row {row} ({len(bad)} in all): time {t_ns[row]} {how} the row above; --repair drops such rows"
-        )
+        raise DatasetError(f"{stream}: row {row} ({len(bad)} in all): time {t_ns[row]} {how} the row above")
+    bad = np.flatnonzero(far(t_ns))
+    if len(bad):
+        raise DatasetError(f"{stream}: row {bad[0]} ({len(bad)} in all): {far_complaint(t_ns, int(bad[0]))}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +105,7 @@ class ReadingStream:
                 f"found {self.z.shape} and {self.sigma.shape}"
             )
         check_rows(self.name, self.t_ns, {"value": self.z}, strict=True)
-        bad = np.flatnonzero(~(self.sigma > 0).all(axis=1))
+        bad = np.flatnonzero(~is_noise(self.sigma))
         if len(bad):
             raise DatasetError(f"{self.name}: row {bad[0]}: sigma must be positive, found {self.sigma[bad[0]]}")
         early = np.flatnonzero(self.received_ns < self.t_ns)
@@ -154,9 +160,7 @@ class AttitudeStream(ReadingStream):
         R = self.z.reshape(-1, 3, 3)
         bad = np.flatnonzero(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
         if len(bad):
-            raise DatasetError(
-                f"attitude: row {bad[0]} ({len(bad)} in all) is not a rotation; --repair drops such rows"
-            )
+            raise DatasetError(f"attitude: row {bad[0]} ({len(bad)} in all) is not a rotation")
 
 
 @dataclass(frozen=True, eq=False)

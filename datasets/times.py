@@ -12,11 +12,26 @@ from .state import LIMIT_NS, TimeArray
 
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Nanoseconds per unit."""
+DAY_NS = 86_400 * 1_000_000_000
+"""Nanoseconds per day."""
+FAR_NS = 400 * DAY_NS
+"""No log is as long as 400 days."""
 NO_TIME = Decimal("nan")
 DATE_UNITS = ("W", "D", "h", "m", "s", "ms", "us", "ns")
 """Units of datetime64 that are whole nanoseconds; months and years are of no fixed length."""
 LONGEST_DATE = 64
 """Characters of a date: 2023-11-14T22:13:20.123456789+00:00 has 35."""
+
+
+def far(t_ns: TimeArray) -> NDArray[np.bool_]:
+    """Return the rows (n,) whose time is more than 400 days from the median: of a clock that was not set."""
+    return np.abs(t_ns - int(np.median(t_ns))) > FAR_NS if len(t_ns) else np.zeros(0, bool)
+
+
+def far_complaint(t_ns: TimeArray, row: int) -> str:
+    """Return how far from the median a row's time is."""
+    days = abs(int(t_ns[row]) - int(np.median(t_ns))) / DAY_NS
+    return f"time {t_ns[row]} ns is {days:.0f} days from the middle of the stream"
 
 
 def times_ns(values: NDArray[Any], unit: str) -> tuple[TimeArray, NDArray[np.bool_]]:

@@ -20,11 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
 from ..files import regular_file
+from ..formats.parquet import read_known
 from ..formats.text_table import EXACT
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..rig import Rig
 from ..state import Array
-from ..trajectory import Trajectory
+from ..trajectory import COLUMNS, Trajectory
 from . import description as d
 from .inertial import FLIP_YZ, flu, read_imu
 from .positions import enu, enu_from_ecef, first_fix, position, position_rows
@@ -253,8 +254,11 @@ def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
 
     regular_file(path)
     try:
-        frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, **EXACT)
-        truth = Trajectory.from_pandas(frame, lookahead_s)
+        if path.suffix == ".parquet":
+            frame = read_known(path, COLUMNS)
+        else:
+            frame = pd.read_csv(path, usecols=lambda name: name in COLUMNS, **EXACT)
+        truth = Trajectory.from_pandas(frame, lookahead_s).with_times_checked()
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}") from None
     except KeyError as error:

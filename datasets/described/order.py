@@ -1,4 +1,4 @@
-"""The times of one stream: counters that wrap, stamps far from all others, and rows out of order."""
+"""The times of one stream: counters that wrap, and rows out of order."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from ..state import TimeArray
 
-FAR_NS = 400 * 86_400 * 1_000_000_000
-"""No log is as long as 400 days; a stamp this far from the stream's median is of a clock that was not set."""
 SLACK_NS = 10 * 1_000_000_000
 """A sensor may start and end 10 s before or after the IMU."""
 RUN_ROWS, RUN_SHARE = 10, 0.05
@@ -43,11 +41,6 @@ def laps(span_ns: tuple[int, int], period_ns: int, imu_ns: tuple[int, int]) -> t
     first = -((span_ns[0] - imu_ns[0] + SLACK_NS) // period_ns)
     last = (imu_ns[1] + SLACK_NS - span_ns[1]) // period_ns
     return nearest, last - first + 1 > (first <= nearest <= last)
-
-
-def far(t_ns: TimeArray) -> NDArray[np.bool_]:
-    """Return the rows that are more than 400 days from the median, in time."""
-    return np.abs(t_ns - int(np.median(t_ns))) > FAR_NS if len(t_ns) else np.zeros(0, bool)
 
 
 def stray(t_ns: TimeArray) -> NDArray[np.bool_]:

@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError
 from ..formats.table import Columns, Flaws
+from ..log import is_noise
 from ..state import LIMIT_NS, Array, TimeArray
-from ..times import times_ns
+from ..times import far, far_complaint, times_ns
 from . import description as d
-from .order import complaint, disorder, far, laps, unwrapped
+from .order import complaint, disorder, laps, unwrapped
 from .sources import Opening
 
 Mask = NDArray[Any]
 LARGEST_SHARE = 0.5
 """Of a stream's rows that --repair drops, for all reasons together; of what is worse, the description is wrong."""
-DAY_NS = 86_400 * 1_000_000_000
-"""Nanoseconds per day."""
 REPEATED_SHARE = 0.5
 """A reading that changes repeats itself by chance in far fewer rows, in all of its components at once."""
 CHANGES = 5
@@ -186,7 +185,7 @@ def read_rows(
         lambda row: f"time is {_shown([rows.raw[column][row] for column in stamps])}",
         "without a time",
     )
-    rows.refuse(far(rows.t_ns), lambda row: _far(rows.t_ns, row), "more than 400 days from the others")
+    rows.refuse(far(rows.t_ns), lambda row: far_complaint(rows.t_ns, row), "more than 400 days from the others")
     _align_counter(rows, time)
     if isinstance(part, d.Window):
         inside = opening.window(stream, part, rows.t_ns)
@@ -273,11 +272,6 @@ def _no_number(rows: Rows, column: d.Column, row: int) -> str:
     return f"column {column!r} holds {word!r}, not a number" + (COMMA_HINT if COMMA.fullmatch(word) else "")
 
 
-def _far(t_ns: TimeArray, row: int) -> str:
-    days = abs(int(t_ns[row]) - int(np.median(t_ns))) / DAY_NS
-    return f"time {t_ns[row]} ns is {days:.0f} days from the middle of the stream"
-
-
 def _align_counter(rows: Rows, time: d.Time) -> None:
     """Move a stream of a counter by whole periods onto the IMU's time, unless the description says how far."""
     imu_ns = rows.opening.imu_ns
@@ -330,7 +324,7 @@ def _spread(rows: Rows, quantity: d.Quantity) -> None:
     read = rows.si(quantity)
     with np.errstate(invalid="ignore", over="ignore"):
         rows.values["spread"] = np.sqrt(read) if isinstance(quantity, d.Variances) else read
-        bad = ~((rows.values["spread"] ** 2 > 0).all(axis=1) & (rows.values["spread"] > 0).all(axis=1))
+        bad = ~is_noise(rows.values["spread"])
     what = "variance" if isinstance(quantity, d.Variances) else "sigma"
     rows.refuse(bad, lambda row: f"{what} must be positive, found {read[row]}", f"without a positive {what}")
 

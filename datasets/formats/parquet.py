@@ -47,6 +47,20 @@ def check_size(path: Path, file: pq.ParquetFile, names: Collection[str]) -> None
         )
 
 
+def read_known(path: Path, names: Collection[str]) -> pd.DataFrame:
+    """Return those of some columns that a file has.
+
+    Raises:
+        DatasetError: as `check_size`; what else pyarrow raises is passed on.
+    """
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(path) as file:
+        found = [name for name in file.schema_arrow.names if name in names]
+        check_size(path, file, found)
+        return file.read(columns=found).to_pandas(ignore_metadata=True)
+
+
 def unpacked(array: pa.Array[Any], *, as_written: bool) -> pd.Series | NDArray[Any]:
     """Return a column: times as datetime64 or timedelta64 in ns (UTC), and exact integers if `as_written`."""
     import pyarrow as pa

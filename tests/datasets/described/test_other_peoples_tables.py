@@ -289,15 +289,11 @@ def test_a_variance_is_the_square_of_a_sigma(folder, unit, factor):
 
 
 @pytest.mark.parametrize("key", ["sigma", "variance"])
-@pytest.mark.parametrize("value", ["0", "-1", "nan", "", "1e-200", "x"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "", "x"])
 def test_a_spread_that_is_not_positive_is_refused_in_every_stream(folder, key, value):
     unit = {"sigma": "m/s", "variance": "(m/s)^2"}[key]
     text = "t,vx,vy,vz,c\n" + "".join(f"{row},{value if i == 2 else 1e-4}\n" for i, row in enumerate(ROWS))
-    value_is_fine = key == "variance" and value == "1e-200"
     part = {"sigma_m_s": None, key: {"columns": ["c"], "unit": unit}}
-    if value_is_fine:  # 1e-200 is a variance, if a small one
-        assert len(dvl(folder, text, **part)[0]) == 6
-        return
     with pytest.raises(DatasetError, match=rf"dvl: row 2 \(1 in all\): {key} must be positive, found \[.*--repair"):
         dvl(folder, text, **part)
     assert len(dvl(folder, text, repair=True, **part)[0]) == 5

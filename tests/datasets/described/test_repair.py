@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fathom.datasets import DatasetError, Log, Mounting
+from fathom.datasets import DatasetError, Log, Mounting, Trajectory
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.opening import open_log
 from fathom.datasets.log import DepthStream, ImuStream
@@ -106,3 +106,19 @@ def test_rows_recorded_twice_are_no_loss(folder):
     log = open_log(folder, repair=True)
     assert len(log.streams["depth"]) == N
     assert "depth: 200 rows out of order (repair) dropped" in log.notes
+
+
+def test_noise_that_is_none_and_times_of_another_year_are_refused_in_every_stream_and_truth(tmp_path):
+    t_ns = np.array([NS, 2 * NS, 3 * NS])
+    z = np.zeros((3, 1))
+    for sigma in (0.0, -1.0, np.nan):
+        with pytest.raises(DatasetError, match=r"depth: row 1: sigma must be positive"):
+            DepthStream(t_ns, t_ns, z, np.array([[1.0], [sigma], [np.inf]]))
+    far = np.array([NS, 2 * NS, 1_700_000_000 * NS])
+    with pytest.raises(DatasetError, match=r"depth: row 2 \(1 in all\): time .* 19676 days from the middle"):
+        DepthStream(far, far, z, z + 1)
+    with pytest.raises(DatasetError, match=r"imu: row 2 \(1 in all\): time .* days from the middle"):
+        ImuStream(far, np.zeros((3, 3)), np.zeros((3, 3)))
+    (tmp_path / "a.tum").write_text("".join(f"{t} 0 0 0 0 0 0 1\n" for t in (0, 1_700_000_000, 1_700_000_001)))
+    with pytest.raises(DatasetError, match=r"a.tum: trajectory: row 0 \(1 in all\): time 0 ns is 19676 days"):
+        Trajectory.from_tum(tmp_path / "a.tum")

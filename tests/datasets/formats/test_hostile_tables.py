@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from fathom.datasets import DatasetError, Trajectory
+from fathom.datasets.described.conversion import _read_trajectory
 from fathom.datasets.formats.columns import read_table
 from fathom.datasets.formats.table import Table
 from limited import limited
@@ -108,6 +109,14 @@ def test_a_trajectory_of_one_endless_line_is_refused(tmp_path, line):
     with pytest.raises(DatasetError, match=r"a.tum: line 1: ") as error:
         limited(lambda: Trajectory.from_tum(tmp_path / "a.tum"), MEGABYTES)
     assert len(str(error.value)) < 1000
+
+
+def test_a_truth_of_ours_is_read_without_what_else_stands_in_its_file(tmp_path):
+    truth = Trajectory(np.arange(3), np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
+    words = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3, np.int32)), pa.array(["x" * 100_000_000]))
+    table = pa.table({**truth.to_columns(), "word": words})
+    pq.write_table(table, tmp_path / "a.parquet", store_schema=False)
+    assert len(limited(lambda: _read_trajectory(tmp_path / "a.parquet", 0.0), MEGABYTES)) == 3
 
 
 def test_a_pipe_is_no_table_and_no_trajectory(tmp_path: Path) -> None:
