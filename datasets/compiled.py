@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, TypeAlias, TypeVar
 
 from numba import njit as typed_njit
 
-from .compiled_cache import CodeCache
+from .compiled_cache import CodeCache, NoPlaceError
 
 Records: TypeAlias = Any
 """An array of records; NumPy's types know nothing of their fields."""
@@ -36,6 +37,7 @@ def inner(function: F) -> F:
 
 
 def _kept(dispatcher: Any) -> Any:
-    """Have numba keep the code of a function in our cache; what `cache=True` does with numba's own."""
-    dispatcher._cache = CodeCache(dispatcher.py_func)
+    """Have numba keep the code of a function in our cache, if any; what `cache=True` does with numba's own."""
+    with suppress(NoPlaceError):
+        dispatcher._cache = CodeCache(dispatcher.py_func)
     return dispatcher

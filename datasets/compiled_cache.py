@@ -119,10 +119,25 @@ def compiled_folder() -> Path:
         return _made(base_folder(), texts)
 
 
+class NoPlaceError(OSError):
+    """There is no folder at all that can be written."""
+
+
 @cache
 def temporary_folder() -> Path:
-    """Return a folder that is removed when this process ends."""
-    base = Path(tempfile.mkdtemp(prefix="fathom-compiled-"))
+    """Return a folder that is removed when this process ends.
+
+    Raises:
+        NoPlaceError: none can be made.
+    """
+    try:
+        base = Path(tempfile.mkdtemp(prefix="fathom-compiled-"))
+    except OSError as error:
+        _warn_once(
+            "no folder can be written, not even a temporary one: every process compiles anew, for half a minute; set "
+            "NUMBA_CACHE_DIR to a folder that can be written"
+        )
+        raise NoPlaceError from error
     atexit.register(shutil.rmtree, base, ignore_errors=True)
     return base
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .errors import DatasetError
 from .rig import Rig
+from .rotations import UNHEARD, complaint, off_rotation
 from .state import Array, Belief, TimeArray
 from .times import far, far_complaint
 from .trajectory import Trajectory
@@ -158,9 +159,9 @@ class AttitudeStream(ReadingStream):
     def __post_init__(self) -> None:
         super().__post_init__()
         R = self.z.reshape(-1, 3, 3)
-        bad = np.flatnonzero(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0) > 1e-6)
+        bad = np.flatnonzero(off_rotation(R) > UNHEARD)
         if len(bad):
-            raise DatasetError(f"attitude: row {bad[0]} ({len(bad)} in all) is not a rotation")
+            raise DatasetError(f"attitude: row {bad[0]} ({len(bad)} in all) is {complaint(R[bad[0]], UNHEARD)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from .quantities import STRICT, Finite, Vector
 from .rig import Mounting
+from .rotations import note, off_rotation, orthonormalised
 
 Matrix = tuple[Vector, Vector, Vector]
 
@@ -19,7 +20,7 @@ class MountingSpec:
 
     Attributes:
         translation_m: p_BS_B.
-        R_BS: the rotation itself, by rows, in place of the angles.
+        R_BS: the rotation itself, by rows, in place of the angles; three decimals are enough to be one.
     """
 
     translation_m: Vector = (0.0, 0.0, 0.0)
@@ -35,11 +36,16 @@ class MountingSpec:
         self.mounting()
         return self
 
+    def notes(self, sensor: str) -> tuple[str, ...]:
+        """Return in a sentence that R_BS was orthonormalised; nothing where it was not."""
+        return () if self.R_BS is None else note(f"{sensor}: mounting", off_rotation(np.array([self.R_BS])))
+
     def mounting(self) -> Mounting:
-        """Return the mounting as the rig holds it."""
+        """Return the mounting as the rig holds it, its rotation without the rounding of its decimals."""
         p_BS_B = np.array(self.translation_m)
         if self.R_BS is not None:
-            return Mounting(np.array(self.R_BS), p_BS_B)
+            R_BS = np.array(self.R_BS)
+            return Mounting(orthonormalised(R_BS, off_rotation(R_BS)), p_BS_B)
         angles_deg = [self.yaw_deg, self.pitch_deg, self.roll_deg]
         if not any(angles_deg):
             return Mounting(np.eye(3), p_BS_B)

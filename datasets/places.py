@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from numpy.typing import ArrayLike, NDArray
 
 from .state import Array
 
-POLE_DEG, TURN_DEG = 90.0, 360.0
-"""The largest latitude; and the largest longitude, since some count from 0° to 360°."""
+MOST_LATITUDE_DEG, MOST_LONGITUDE_DEG = 90.0, 360.0
+"""The poles; charts count longitudes from −180° to 180° or from 0° to 360°, some of them westwards."""
 UNITS = ("deg", "rad", "ddmm", "ddmmss", "degE7")
 """ddmm is degrees · 100 + minutes, as NMEA writes it; ddmmss has seconds too; degE7 is 1e-7°, as MAVLink writes it."""
 LONGEST_TEXT = 40
@@ -79,19 +78,22 @@ def turned_by(letters: list[str], hemispheres: str, values: Array) -> Array:
     return np.where(good, np.where(negative, -np.abs(values), values), np.nan)
 
 
-def on_earth(latitude_deg: Any, longitude_deg: Any = 0.0) -> NDArray[np.bool_]:
-    """Return which places exist; NaN does not."""
-    return np.asarray((np.abs(latitude_deg) <= POLE_DEG) & (np.abs(longitude_deg) <= TURN_DEG))
+def is_place(latitude_deg: ArrayLike, longitude_deg: ArrayLike = 0.0) -> NDArray[np.bool_]:
+    """Return where a latitude and a longitude, degrees, are a place on Earth; what is not finite is none."""
+    with np.errstate(invalid="ignore"):
+        north, east = np.abs(latitude_deg), np.abs(longitude_deg)
+        return np.asarray((north <= MOST_LATITUDE_DEG) & (east <= MOST_LONGITUDE_DEG))
 
 
-def _said(hemispheres: str) -> BeforeValidator:
-    def parsed(value: Any) -> Any:
-        return math.degrees(angle(value, "deg", hemispheres)) if isinstance(value, str) else value
+def degrees_said(value: Any, hemispheres: str) -> Any:
+    """Return the degrees of a text as 41°11'06" N; what is no text, as it is.
 
-    return BeforeValidator(parsed)
-
-
-Latitude = Annotated[float, Field(ge=-POLE_DEG, le=POLE_DEG), _said("NS")]
-"""°, north positive; or a text such as 41°11'06" N."""
-Longitude = Annotated[float, Field(ge=-TURN_DEG, le=TURN_DEG), _said("EW")]
-"""°, east positive; or a text such as 8 42.36 W."""
+    Raises:
+        ValueError: the text says no such angle.
+    """
+    if not isinstance(value, str):
+        return value
+    found = math.degrees(angle(value, "deg", hemispheres))
+    if math.isnan(found):
+        raise ValueError(f"expected degrees, as 41.185 or 41°11'06\" {hemispheres[0]}, found {value[:LONGEST_TEXT]!r}")
+    return found

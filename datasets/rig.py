@@ -8,11 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .errors import DatasetError
-from .places import on_earth
+from .places import is_place
+from .rotations import UNHEARD, complaint, off_rotation
 from .state import Array
 
 EARTH_RATE_RAD_S = 7.292115e-5
 """rad/s, from WGS 84: 15.04 °/h."""
+LEAST_GRAVITY, MOST_GRAVITY = 9.7, 9.9
+"""m/s²: at sea level it is from 9.780 at the equator to 9.832 at the poles; the deepest sea adds 0.03."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +31,21 @@ class Mounting:
 
     def __post_init__(self) -> None:
         R, p = np.asarray(self.R_BS, float), np.asarray(self.p_BS_B, float)
-        orthonormal = R.shape == (3, 3) and np.allclose(R @ R.T, np.eye(3), atol=1e-9) and np.linalg.det(R) > 0
-        if not orthonormal:
-            raise DatasetError(f"mounting: R_BS must be a 3 × 3 rotation, found {self.R_BS!r}")
+        if R.shape != (3, 3):
+            raise DatasetError(f"mounting: R_BS must be a 3 × 3 rotation, found the shape {R.shape}")
+        if off_rotation(R) > UNHEARD:
+            raise DatasetError(f"mounting: R_BS must be a 3 × 3 rotation; it is {complaint(R, UNHEARD)}")
         if p.shape != (3,) or not np.isfinite(p).all():
             raise DatasetError(f"mounting: p_BS_B must be three finite metres, found {self.p_BS_B!r}")
 
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """IMU noise, equal on the three axes; from the data sheet or an Allan-variance fit."""
+    """IMU noise, equal on the three axes; from the data sheet or an Allan-variance fit.
+
+    Raises:
+        DatasetError: a figure is negative or not finite.
+    """
 
     gyro_density: float  # rad/s/√Hz, white
     accel_density: float  # m/s²/√Hz, white
@@ -45,6 +53,11 @@ class ImuNoise:
     accel_walk: float  # m/s³/√Hz, random walk of the bias
     gyro_bias_sigma: float  # rad/s, at turn-on
     accel_bias_sigma: float  # m/s², at turn-on
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise DatasetError(f"imu noise: {name} must be finite and not negative, found {value}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +81,9 @@ class Rig:
     latitude_deg: float | None = None
 
     def __post_init__(self) -> None:
-        if not 9.7 < self.gravity < 9.9:
+        if not LEAST_GRAVITY < self.gravity < MOST_GRAVITY:
             raise DatasetError(f"rig: gravity must be in m/s² and positive, found {self.gravity}")
-        if self.latitude_deg is not None and not on_earth(self.latitude_deg):
+        if self.latitude_deg is not None and not is_place(self.latitude_deg):
             raise DatasetError(f"rig: latitude_deg must lie between −90 and 90, found {self.latitude_deg}")
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
 from .files import regular_file
+from .rotations import TOLERANCE, complaint, is_rotation, note, off_rotation, off_unit, orthonormalised
 from .state import DIM, Array, Belief, NavState, TimeArray
 from .times import far, far_complaint, seconds_to_ns, times_ns
 
@@ -45,6 +46,7 @@ class Trajectory:
         P: (n, 15, 15) covariance of the error state, or None; rows of NaN where it was not asked for.
         lookahead_s: how much of the future each state has seen: 0 for a filter, the lag for a fixed-lag smoother,
             infinity for a batch.
+        notes: what was mended on reading, one sentence each.
     """
 
     t_ns: TimeArray
@@ -55,6 +57,7 @@ class Trajectory:
     b_g: Array | None = None
     P: Array | None = None
     lookahead_s: float = 0.0
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.t_ns)
@@ -97,7 +100,21 @@ class Trajectory:
             pick(self.b_g),
             pick(self.P),
             self.lookahead_s,
+            self.notes,
         )
+
+    def with_rotations(self) -> Trajectory:
+        """Return it with the rounding of its decimals taken out of R_WB, which a note tells; rows of NaN are unknown.
+
+        Raises:
+            DatasetError: a row is not a rotation.
+        """
+        known = ~np.isnan(self.R_WB).all(axis=(1, 2))
+        off = np.where(known, off_rotation(self.R_WB), 0.0)
+        bad = np.flatnonzero(~is_rotation(off))
+        if len(bad):
+            raise DatasetError(f"trajectory: row {bad[0]} ({len(bad)} in all): R_WB is {complaint(self.R_WB[bad[0]])}")
+        return replace(self, R_WB=orthonormalised(self.R_WB, off), notes=(*self.notes, *note("trajectory", off)))
 
     def state(self, row: int) -> NavState:
         """Return one row as a state; unknown parts are zero."""
@@ -135,8 +152,13 @@ class Trajectory:
                 file.write(f"{sign}{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
 
     @classmethod
-    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0) -> Trajectory:
-        """Read a TUM file; times keep their nanoseconds.
+    def from_tum(cls, path: Path | str, lookahead_s: float = 0.0, *, quoting: bool = True) -> Trajectory:
+        """Read a TUM file; times keep their nanoseconds, and quaternions get the length one.
+
+        Args:
+            path: of the file.
+            lookahead_s: see the class.
+            quoting: whether an error may show a line of the file.
 
         Raises:
             DatasetError: names the file: it is missing or cannot be read, a row without eight numbers, a quaternion
@@ -151,7 +173,7 @@ class Trajectory:
                     if not fields or fields[0].startswith("#"):
                         continue
                     try:
-                        stamp_ns, pose = _pose(line, fields)
+                        stamp_ns, pose = _pose(line if quoting else "", fields)
                     except ValueError as error:
                         raise DatasetError(f"{path}: line {number}: {error}") from None
                     t_ns.append(stamp_ns)
@@ -163,9 +185,9 @@ class Trajectory:
         values = np.array(poses).reshape(-1, 7)
         R_WB = Rotation.from_quat(values[:, 3:]).as_matrix()
         try:
-            return cls(
-                np.array(t_ns, dtype=np.int64), R_WB, values[:, :3], lookahead_s=lookahead_s
-            ).with_times_checked()
+            notes = note("trajectory", off_unit(values[:, 3:]))
+            times = np.array(t_ns, dtype=np.int64)
+            return cls(times, R_WB, values[:, :3], lookahead_s=lookahead_s, notes=notes).with_times_checked()
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
 
@@ -220,7 +242,7 @@ class Trajectory:
 
 
 def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
-    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw.
+    """Return the time (ns) of a line of a TUM file, and x y z qx qy qz qw; an error shows the line, if there is one.
 
     Raises:
         ValueError: what is wrong with it.
@@ -228,11 +250,12 @@ def _pose(line: str, fields: list[str]) -> tuple[int, list[float]]:
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
-        raise ValueError(f"not numbers: {line.rstrip()[:60]!r}") from None
+        found = f": {line.rstrip()[:60]!r}" if line else "; is this a TUM file?"
+        raise ValueError(f"not numbers{found}") from None
     stamp_ns = seconds_to_ns(fields[0])
     if len(numbers) != 8:
         raise ValueError(f"expected t x y z qx qy qz qw, found {len(numbers)} fields")
     length = math.hypot(*numbers[4:])
-    if not (all(map(math.isfinite, numbers)) and abs(length - 1) < 1e-3):
+    if not (all(map(math.isfinite, numbers)) and abs(length - 1) <= TOLERANCE):
         raise ValueError(f"not a finite pose with a unit quaternion (|q| = {length:.6g})")
     return stamp_ns, numbers[1:]

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field
 
 from ..datasets.epochs import SENSOR, Epoch
 from ..datasets.errors import nearest
+from ..datasets.quantities import Number, Positive
 from ..datasets.rig import Rig
 from ..datasets.state import Belief
 from ..datasets.trajectory import Trajectory
@@ -34,11 +35,9 @@ def sensors_among(known: frozenset[str]) -> AfterValidator:
 
 Factors = Annotated[frozenset[str], sensors_among(FACTORS)]
 """Which aiding sensors an estimator may use."""
-Inflation = Annotated[
-    dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]], sensors_among(FACTORS | {"gyro", "accel"})
-]
+Inflation = Annotated[dict[str, Positive], sensors_among(FACTORS | {"gyro", "accel"})]
 """Factor on the stated sigma by sensor; also "gyro" and "accel"."""
-Gate = Annotated[dict[str, Annotated[float, Field(gt=0, lt=1)]], sensors_among(FACTORS)]
+Gate = Annotated[dict[str, Annotated[Number, Field(gt=0, lt=1)]], sensors_among(FACTORS)]
 """Probability by sensor: a reading is left out if its NIS exceeds the chi-square quantile of this probability."""
 
 

@@ -8,14 +8,13 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 
+from ..datasets.quantities import NotNegative, Positive, Whole
 from ..datasets.rig import Rig
 from ..datasets.state import Belief
 from .interface import FACTORS, Factors, Inflation, Pass
 from .robust import Losses
 
 DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 def _once(dvl: frozenset[DvlFactor]) -> frozenset[DvlFactor]:
@@ -71,7 +70,7 @@ class GraphSmoother(ABC):
     keyframe_period_s: Positive | None = None
     keyframe_timeout_s: Positive = 0.5
     max_hold_s: Positive = 1.5
-    merge_ns: int = Field(default=5_000_000, ge=0)
+    merge_ns: Whole = Field(default=5_000_000, ge=0)
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     robust: Losses = Field(default_factory=dict)
@@ -106,7 +105,7 @@ class LaggedSmoother(GraphSmoother):
         lag_s: length of the window; with 0 it keeps the newest keyframe only, and is a filter.
     """
 
-    lag_s: NonNegative = 3.0
+    lag_s: NotNegative = 3.0
 
     @property
     def window_s(self) -> float:

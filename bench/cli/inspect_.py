@@ -39,14 +39,16 @@ def inspect(
     """
     from rich.console import Console
 
+    from ...datasets.errors import shown
     from ..inspection.contents import print_contents
     from ..inspection.inspecting import inspect_log, open_to_inspect
     from ..inspection.page import page_file, print_inspection, save_page
     from ..output.tables.terminal import console
 
-    undescribed = _undescribed(Path(log))
+    path = Path(log).resolve() if Path(log).is_symlink() else Path(log)
+    undescribed = _undescribed(path)
     if undescribed is not None:
-        held = undescribed.contents(Path(log).parent)
+        held = undescribed.contents(path.parent)
         print_contents(held, console())
         return
     page_file(out, "")  # refuses before anything is read
@@ -57,7 +59,7 @@ def inspect(
         status.update(f"drawing {file}")
         save_page(inspection, file)
     print_inspection(inspection, console())
-    typer.echo(f"figure: {file}")
+    typer.echo(shown(f"figure: {file}"))
 
 
 def _undescribed(path: Path) -> Recording | None:

@@ -22,8 +22,10 @@ class Listing(StrEnum):
 
 def list_(what: Annotated[Listing, typer.Argument(metavar="LIST")]) -> None:
     """List estimators, logs, experiments or scores."""
+    from ...datasets.errors import shown
+
     for name, about in LISTS[what]().items():
-        line = f"{name}: {about}" if about else name
+        line = shown(f"{name}: {about}" if about else name)
         typer.echo(folded(line, get_terminal_size().columns) if sys.stdout.isatty() else line)
 
 

@@ -18,18 +18,19 @@ def simulate(
     out: Annotated[
         Path, typer.Option("-o", "--out", metavar="DIR", help="Folder to write; it must not hold a log already.")
     ],
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of all random numbers.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, metavar="N", help="Seed of all random numbers.")] = 1,
 ) -> None:
     """Simulate a mission and write it as a log.
 
     The log is a folder of Parquet files with a log.yaml.
     """
     from ...datasets.described.folder import write_folder
+    from ...datasets.errors import shown
     from ...datasets.simulated import simulator
 
     log = simulator.simulate(_scenario(scenario), seed)
     write_folder(log, out)
-    typer.echo(f"{out}: {log.name}, {log.duration_s:.0f} s, {', '.join(['imu', *log.streams, 'truth'])}")
+    typer.echo(shown(f"{out}: {log.name}, {log.duration_s:.0f} s, {', '.join(['imu', *log.streams, 'truth'])}"))
 
 
 def _scenario(text: str) -> Scenario:

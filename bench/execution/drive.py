@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.epochs import Epoch, Voyage, cut
+from ...datasets.errors import one_line
 from ...datasets.log import AttitudeStream, HeadingStream, Log
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Belief, TimeArray
@@ -171,7 +172,7 @@ def run_log(
         except Diverged as error:
             ending = Ending("diverged", str(error), voyage.start_ns)
         except Exception as error:
-            ending = Ending("failed", _describe(error), voyage.start_ns)
+            ending = Ending("failed", one_line(error), voyage.start_ns)
         else:
             ending = _drive(run, voyage, recorder, limit_ns, collector)
             smoothed, finish_ns, ending = _finish(run, voyage, ending)
@@ -235,7 +236,7 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
     except Diverged as error:
         return Ending("diverged", str(error), t_ns)
     except Exception as error:
-        return Ending("failed", _describe(error), t_ns)
+        return Ending("failed", one_line(error), t_ns)
     if voyage.failure is not None:
         return Ending("failed", voyage.failure, t_ns)
     return Ending("done")
@@ -254,13 +255,8 @@ def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | Non
         if ending.status == "done":
             lost = isinstance(error, Diverged)
             end_ns = voyage.epochs[-1].t_ns if voyage.epochs else voyage.start_ns
-            ending = Ending("diverged" if lost else "failed", str(error) if lost else _describe(error), end_ns)
+            ending = Ending("diverged" if lost else "failed", str(error) if lost else one_line(error), end_ns)
     return smoothed, perf_counter_ns() - started, ending
-
-
-def _describe(error: Exception) -> str:
-    """Return type and message of an error, on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ...datasets.errors import shown
 from ...datasets.trajectory import COVARIANCE, Trajectory
 from ...estimators.registry import package_of
 from ..experiment.plan import Experiment, Run
@@ -78,7 +79,7 @@ class Task:
             "seed": run.seed,
             "output": output,
             "status": status,
-            "cause": cause,
+            "cause": None if cause is None else shown(cause),
             "align": self.scoring.align,
             "dims": self.scoring.dims,
             "estimator": run.estimator.name,

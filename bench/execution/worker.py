@@ -15,7 +15,7 @@ from platform import node
 
 import numpy as np
 
-from ...datasets.errors import DatasetError
+from ...datasets.errors import DatasetError, one_line
 from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
@@ -71,7 +71,7 @@ class WorkerCache:
                 )
             return self.finished(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
         except Exception as error:
-            return Finished([task.row("failed", f"{type(error).__name__}: {error}") | {"started": started}])
+            return Finished([task.row("failed", one_line(error)) | {"started": started}])
 
     def open(self, task: Task) -> Log:
         """Open or simulate the task's log, unless it is one of the last.

@@ -11,7 +11,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from ...datasets.errors import nearest
+from ...datasets.errors import nearest, shown
+from ...datasets.quantities import Positive, Whole
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import FACTORS, sensors_among
 from ..metrics.alignment import Alignment
@@ -67,7 +68,7 @@ class LogEntry:
         return tuple(
             replace(
                 full,
-                name=f"{name} {words}".rstrip(),
+                name=shown(f"{name} {words}".rstrip()),
                 scenario=None if self.scenario is None else changed(self.scenario, changes),
             )
             for words, changes in points(self.grid)
@@ -125,7 +126,7 @@ class EstimatorEntry:
         found = []
         for words, changes in points(self.grid):
             options = changed(self.options, changes)
-            full = EstimatorSpec(self.name, f"{label} {words}".rstrip(), options, self.baseline)
+            full = EstimatorSpec(self.name, shown(f"{label} {words}".rstrip()), options, self.baseline)
             has = full.create().factors
             less = {f"no {sensor}": has - {sensor} for sensor in self.drop}
             less |= {f"only {' + '.join(kept) or 'the IMU'}": frozenset(kept) for kept in self.only}
@@ -190,7 +191,7 @@ class Settings:
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     description: str = ""
     seeds: Annotated[
-        tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1), BeforeValidator(_counted_from_one)
+        tuple[Annotated[Whole, Field(ge=0, lt=2**63)], ...], Field(min_length=1), BeforeValidator(_counted_from_one)
     ] = (1,)
     scores: Scoring = Scoring()
     baseline: str | None = None
@@ -200,8 +201,8 @@ class Settings:
         "velocity_rmse_m_s",
     )
     tune: SplitPatterns = SplitPatterns()
-    max_gap_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
-    timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1800.0
+    max_gap_s: Positive = 1.0
+    timeout_s: Positive = 1800.0
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)

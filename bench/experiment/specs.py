@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...datasets.described.opening import CATALOG
+from ...datasets.errors import DatasetError
+from ...datasets.files import regular_file
 from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
@@ -80,8 +82,8 @@ class LogSpec:
         """Of the recorded path that a simulated log follows; None if it follows none, or the file cannot be read."""
         path = Scenario.from_dict(self.scenario or {}).path if self.scenario is not None else None
         try:
-            return None if path is None else sha256(Path(path).read_bytes()).hexdigest()
-        except OSError:  # the run will say so
+            return None if path is None else sha256(regular_file(Path(path)).read_bytes()).hexdigest()
+        except (OSError, DatasetError):  # the run will say so
             return None
 
     def open(self, seed: int | None, data: Path | None = None, repair: bool = False) -> Log:

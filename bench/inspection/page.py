@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from warnings import catch_warnings, filterwarnings
 
-from ...datasets.errors import DatasetError
+from ...datasets.errors import DatasetError, shown
 from ..drawing import empty_figure
 from ..files import writing
 from .inspecting import Inspection
@@ -73,8 +73,7 @@ def draw_inspection(inspection: Inspection) -> Figure:
     said = (
         "nothing looks wrong" if not count else f"{count} things look wrong" if count > 1 else "one thing looks wrong"
     )
-    name = "".join(letter if letter.isprintable() else " " for letter in log.name)
-    figure.suptitle(f"{name}, {log.duration_s:.0f} s: {said}", fontsize=11, parse_math=False)
+    figure.suptitle(f"{shown(log.name)}, {log.duration_s:.0f} s: {said}", fontsize=11, parse_math=False)
     return figure
 
 

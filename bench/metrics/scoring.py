@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from ...datasets.epochs import SENSOR
 from ...datasets.log import Log
-from ...datasets.quantities import Positive
+from ...datasets.quantities import Number, Positive, Whole
 from ...datasets.trajectory import Trajectory
 from .absolute_error import ate, drift, horizontal_error, outage_drift
 from .alignment import Alignment, align
@@ -98,8 +98,8 @@ class Scoring:
     rpe_unit: Unit = "m"
     rpe_pairs: Pairs = "all"
     segment_lengths_m: tuple[Positive, ...] = (50.0, 100.0, 200.0, 400.0)
-    score_period_s: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
-    nees_epochs: Annotated[int, Field(ge=1, le=1000)] = 10
+    score_period_s: Annotated[Number, Field(ge=1e-3, le=1e6)] = 1.0
+    nees_epochs: Annotated[Whole, Field(ge=1, le=1000)] = 10
     nis: bool = False
     floor: bool = False
 

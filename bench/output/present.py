@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
 import typer
 from rich.console import Console
 
+from ...datasets.errors import shown
 from ..execution.sweep import Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
 from ..files import writing
@@ -28,7 +28,10 @@ from .tables.table import (
     write_table,
 )
 
-say = partial(typer.echo, err=True)
+
+def say(message: str) -> None:
+    """Print on standard error."""
+    typer.echo(shown(message), err=True)
 
 
 def print_log(rows: pd.DataFrame, plan: Experiment) -> None:

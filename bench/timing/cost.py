@@ -17,6 +17,7 @@ from rich.console import Console
 from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic, looks_of, save
 from ..execution.sweep import run_experiment
 from ..experiment.plan import Experiment
+from ..files import write_csv
 from ..metrics import pooled_rmse
 from ..results.summary import Record, groups, records
 from .printing import machine_text, made
@@ -178,7 +179,7 @@ def write_cost(rows: pd.DataFrame, folder: Path) -> list[Path]:
     """Write cost.md, cost.csv and the figure accuracy-cost into the folder; return the files."""
     page, table = folder / "cost.md", folder / "cost.csv"
     page.write_text(cost_markdown(rows), encoding="utf-8")
-    pd.DataFrame(cost_records(rows)).to_csv(table, index=False)
+    write_csv(pd.DataFrame(cost_records(rows)), table)
     return [page, table, *save(draw_accuracy_cost(rows), folder / "accuracy-cost")]
 
 

@@ -14,6 +14,7 @@ from ...datasets import Log, Scenario, simulate
 from ...estimators.interface import Estimator
 from ...estimators.registry import ESTIMATORS, create, package_of
 from ..drawing import PALETTE, WIDTH_IN, empty_figure, looks_of, save
+from ..files import write_csv
 from ..output.cells import ABSENT, Cell
 from ..output.sheets import Line, Sheet
 from ..output.tables import terminal
@@ -183,7 +184,7 @@ def print_profile(names: Sequence[str], folder: Path | None) -> None:
             some = {name: one for name, one in estimators.items() if LONGEST_S.get(name, LONG_S) == duration_s}
             courses |= over_log(some, _survey(duration_s), tell=status.update)
     files = [folder / "profile.csv"]
-    pd.DataFrame([one.record() for one in profiles]).to_csv(files[0], index=False)
+    write_csv(pd.DataFrame([one.record() for one in profiles]), files[0])
     title = f"{log.name}, {log.duration_s:.0f} s"
     files += save(draw_profile(profiles, f"{title}: where the time goes"), folder / "profile")
     files += save(draw_by_lag(lags, looks, f"{title}: steps against lag"), folder / "step-against-lag")

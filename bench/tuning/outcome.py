@@ -15,6 +15,7 @@ from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..errors import ExperimentError
@@ -217,7 +218,7 @@ def print_outcome(outcome: Outcome, console: Console | None = None) -> None:
     tuning = outcome.tuning
     runs = (len(tuning.split.train), len(outcome.held_out[0].values) if outcome.held_out else 0)
     headings = [f"{side}, {n} {'run' if n == 1 else 'runs'}" for side, n in zip(SIDES, runs, strict=True)]
-    title = f"{tuning.estimator.label}: {tuning.objective.score}"
+    title = Text(f"{tuning.estimator.label}: {tuning.objective.score}", "table.title")
     scores = Table("", *headings, title=title, title_justify="left", box=box.SIMPLE_HEAD)
     scores.caption, scores.caption_justify = _caption(outcome), "left"
     held = outcome.held_out or (None, None)

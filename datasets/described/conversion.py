@@ -12,18 +12,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
-from ..files import regular_file
+from ..files import inside
 from ..formats.parquet import read_known
 from ..formats.text_table import EXACT
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..rig import Rig
+from ..rotations import (
+    complaint,
+    complaint_of_quaternion,
+    is_rotation,
+    note,
+    off_rotation,
+    off_unit,
+    orthonormalised,
+)
 from ..state import Array
 from ..trajectory import COLUMNS, Trajectory
 from . import description as d
@@ -31,8 +38,6 @@ from .inertial import FLIP_YZ, flu, read_imu
 from .positions import enu, enu_from_ecef, first_fix, position, position_rows
 from .rows import Rows, check_width, drop_outliers, read_rows, sigma
 from .sources import Opening, wrong_clock
-
-Mask = NDArray[Any]
 
 
 @contextmanager
@@ -73,6 +78,11 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
+        opening.notes += (f"truth: {mended}" for mended in truth.notes)
+    for name, part in description.parts.items():
+        mounting = getattr(part, "mounting", None)
+        opening.notes += () if mounting is None else mounting.notes(name)
+    opening.notes += () if description.prior is None else description.prior.notes
 
     with _named(folder):
         mountings = {
@@ -184,12 +194,6 @@ def _heading(
     return HeadingStream(rows.t_ns, rows.received_ns, rows.values["z"], sigma(rows, part, 1))
 
 
-def _not_rotations(R: Array) -> Mask:
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
-        return np.asarray(~(off < 1e-6) | ~(np.linalg.det(R) > 0))
-
-
 def _put_rotations(rows: Rows, part: d.Attitude, origin: tuple[float, float] | None) -> None:
     """Put the value "R" (n, 3, 3), body FLU to W; refuse what is not a rotation."""
     values = np.stack([rows.raw[c] for c in part.columns], axis=1).astype(float, copy=False)
@@ -198,15 +202,17 @@ def _put_rotations(rows: Rows, part: d.Attitude, origin: tuple[float, float] | N
         R = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix().reshape(-1, 3, 3)
     elif part.form == "matrix":
         R = values.reshape(-1, 3, 3)
-        bad = _not_rotations(R)
-        rows.refuse(bad, lambda row: f"not a rotation matrix: {values[row]}", "without a rotation")
-        R = R[~bad]
+        off = off_rotation(R)
+        good = is_rotation(off)
+        rows.refuse(~good, lambda row: complaint(R[row]), "without a rotation")
+        rows.opening.notes += note(rows.stream, off[good])
+        R = orthonormalised(R[good], off[good])
     else:
-        with np.errstate(over="ignore"):
-            length = np.linalg.norm(values, axis=1)
-        bad = ~(np.abs(length - 1) < 1e-3)
-        rows.refuse(bad, lambda row: f"not a unit quaternion (|q| = {length[row]:.6g})", "without a unit quaternion")
-        q_xyzw = values[~bad] if part.form == "quaternion_xyzw" else np.roll(values[~bad], -1, axis=1)
+        off = off_unit(values)
+        good = is_rotation(off)
+        rows.refuse(~good, lambda row: complaint_of_quaternion(values[row]), "without a unit quaternion")
+        rows.opening.notes += note(rows.stream, off[good])
+        q_xyzw = values[good] if part.form == "quaternion_xyzw" else np.roll(values[good], -1, axis=1)
         R = Rotation.from_quat(q_xyzw).as_matrix().reshape(-1, 3, 3)
     if part.world == "NED":
         R = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]) @ R
@@ -231,9 +237,9 @@ def _truth(
 ) -> Trajectory:
     if rows is None:
         if part.tum is not None:
-            truth = Trajectory.from_tum(opening.folder / part.tum, part.lookahead_s)
+            truth = Trajectory.from_tum(inside(opening.folder, part.tum), part.lookahead_s)
         else:
-            truth = _read_trajectory(opening.folder / str(part.trajectory), part.lookahead_s)
+            truth = _read_trajectory(inside(opening.folder, str(part.trajectory)), part.lookahead_s)
         return truth.select(opening.window("truth", part, truth.t_ns))
     if part.attitude is not None:
         _put_rotations(rows, part.attitude, origin)
@@ -252,13 +258,13 @@ def _truth(
 def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     import pandas as pd
 
-    regular_file(path)
     try:
         if path.suffix == ".parquet":
             frame = read_known(path, COLUMNS)
         else:
-            frame = pd.read_csv(path, usecols=lambda name: name in COLUMNS, **EXACT)
-        truth = Trajectory.from_pandas(frame, lookahead_s).with_times_checked()
+            with path.open("rb") as file:  # of a name alone pandas might make an address or a home
+                frame = pd.read_csv(file, usecols=lambda name: name in COLUMNS, **EXACT)
+        truth = Trajectory.from_pandas(frame, lookahead_s).with_times_checked().with_rotations()
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}") from None
     except KeyError as error:
@@ -268,10 +274,4 @@ def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     bad = np.flatnonzero(~np.isfinite(truth.p_WB_W).all(axis=1))
     if len(bad):
         raise DatasetError(f"{path}: row {bad[0]} ({len(bad)} in all): position is {truth.p_WB_W[bad[0]]}")
-    unknown = np.isnan(truth.R_WB).all(axis=(1, 2))
-    bad = np.flatnonzero(_not_rotations(truth.R_WB) & ~unknown)
-    if len(bad):
-        raise DatasetError(
-            f"{path}: row {bad[0]} ({len(bad)} in all): R_WB is not a rotation: {truth.R_WB[bad[0]].ravel()}"
-        )
     return truth

@@ -19,13 +19,14 @@ from ..files import regular_file
 from ..formats.recording import Recording, loader
 from ..formats.table import Column, Part, Table
 from ..mounting import Matrix, MountingSpec
-from ..places import Latitude, Longitude
-from ..quantities import DEGREE, Finite, NotNegative, Positive, Vector
+from ..quantities import DEGREE, Finite, Latitude, Longitude, NotNegative, Number, Positive, Vector, Whole
 from ..rig import ImuNoise
+from ..rotations import complaint, is_rotation, note, off_rotation, orthonormalised
 from ..state import LIMIT_NS, Array, Belief, NavState
 
-Sigma = Annotated[float, Field(gt=0)]
-Shift = Annotated[float, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
+Sigma = Annotated[Number, Field(gt=0)]
+"""Infinite for a component that is not measured."""
+Shift = Annotated[Number, Field(gt=-LIMIT_NS / 2e9, lt=LIMIT_NS / 2e9)]
 """A shift of a time, s: at most 73 years, so that no sum overflows."""
 Checked = TypeVar("Checked", bound=BaseModel)
 
@@ -47,7 +48,7 @@ class Message(Part):
 
     names: Annotated[tuple[str, ...], Field(min_length=1)]
     """Several are joined by equal device times; columns are then `Name.field`."""
-    entity: int | None = None
+    entity: Whole | None = None
     """Which of several senders of that name. In IMC `src_ent`, any if left out; in ArduPilot the instance, which may
     be left out only if there is one."""
     clock: DeviceClock | None = None
@@ -295,19 +296,19 @@ class Outliers(Part):
     """The whole row is dropped if the norm of these components, in SI, exceeds `above`."""
 
     above: Positive
-    components: tuple[Annotated[int, Field(ge=0, le=2)], ...] | None = None
+    components: tuple[Annotated[Whole, Field(ge=0, le=2)], ...] | None = None
     """Which, from 0; all when left out."""
 
 
 class NoiseDescription(Part):
     """The IMU's noise, equal on three axes; `ImuNoise` has the units."""
 
-    gyro_density: NotNegative
-    accel_density: NotNegative
+    gyro_density: Positive
+    accel_density: Positive
     gyro_walk: NotNegative
     accel_walk: NotNegative
-    gyro_bias_sigma: NotNegative
-    accel_bias_sigma: NotNegative
+    gyro_bias_sigma: Positive
+    accel_bias_sigma: Positive
 
     def noise(self) -> ImuNoise:
         """Return the noise, in our types."""
@@ -347,7 +348,7 @@ class StreamDescription(SourceDescription, Window):
 
     drop_repeats: bool = False
     """Leave out a row with the same values as the row before: a reading that was published again under a new stamp."""
-    every: Annotated[int, Field(ge=1)] = 1
+    every: Annotated[Whole, Field(ge=1)] = 1
     """Keep every n-th of the remaining rows; of the IMU's, the means of n."""
 
 
@@ -379,6 +380,8 @@ class AidingDescription(StreamDescription):
         names = (self.sigma_field, "sigma", "variance")
         if sum(getattr(self, name) is not None for name in names) != 1:
             raise ValueError(f"give one of `{self.sigma_field}`, `sigma` (columns) and `variance` (columns)")
+        if np.isinf(np.asarray(getattr(self, self.sigma_field) or 0.0)).all():
+            raise ValueError(f"{self.sigma_field}: with no finite sigma the sensor measures nothing; leave it out")
         return self
 
 
@@ -520,13 +523,13 @@ class TruthDescription(Placed, Window):
     tum: str | None = None
     trajectory: str | None = None
     """.parquet or .csv with the columns of `Trajectory.to_pandas`."""
-    lookahead_s: NotNegative | Annotated[float, Field(ge=0)] = 0.0
+    lookahead_s: Annotated[Number, Field(ge=0)] = 0.0
     table: Table | None = None
     message: Message | None = None
     time: Time | None = None
     valid: Valid | None = None
     drop_repeats: bool = False
-    every: Annotated[int, Field(ge=1)] = 1
+    every: Annotated[Whole, Field(ge=1)] = 1
     height_m: Finite | None = None
     """Constant height above the sea surface, if the source has no height."""
     velocity: Velocity | None = None
@@ -567,7 +570,7 @@ def _is_covariance(P: Array) -> bool:
 class PriorDescription(Part):
     """A belief at the start, in our frames and SI."""
 
-    t_ns: Annotated[int, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
+    t_ns: Annotated[Whole, Field(gt=-LIMIT_NS, lt=LIMIT_NS)]
     R_WB: Matrix
     p_WB_W: Vector
     v_WB_W: Vector
@@ -581,17 +584,22 @@ class PriorDescription(Part):
         if len(self.P) != 15 or any(len(row) != 15 for row in self.P):
             raise ValueError("P: expected 15 rows of 15")
         R, P = np.array(self.R_WB), np.array(self.P)
-        with np.errstate(over="ignore", invalid="ignore"):
-            if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
-                raise ValueError("R_WB is not a rotation")
+        if not is_rotation(off_rotation(R)):
+            raise ValueError(f"R_WB is {complaint(R)}")
         if not _is_covariance(P):
             raise ValueError("P is not symmetric and positive semi-definite")
         return self
 
     def belief(self) -> Belief:
-        """Return the belief, in our types."""
+        """Return the belief, in our types, its rotation without the rounding of its decimals."""
+        R_WB = np.array(self.R_WB)
         vectors = [np.array(x) for x in (self.p_WB_W, self.v_WB_W, self.b_a, self.b_g)]
-        return Belief(self.t_ns, NavState(np.array(self.R_WB), *vectors), np.array(self.P))
+        return Belief(self.t_ns, NavState(orthonormalised(R_WB, off_rotation(R_WB)), *vectors), np.array(self.P))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """That R_WB was orthonormalised, in a sentence; nothing where it was not."""
+        return note("prior", off_rotation(np.array([self.R_WB])))
 
 
 class Description(Window):
@@ -667,7 +675,7 @@ def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise DatasetError(f"{where}: " + f"\n{where}: ".join(complaints(error, model, above))) from None
+        raise DatasetError(*(f"{where}: {complaint}" for complaint in complaints(error, model, above))) from None
     except (RecursionError, OverflowError) as error:
         raise DatasetError(f"{where}: cannot be understood: {error}") from None
 

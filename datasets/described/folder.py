@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -69,21 +72,41 @@ def write_folder(log: Log, folder: Path | str, fmt: Literal["parquet", "csv"] = 
         vectors = {name: getattr(state, name).tolist() for name in ("R_WB", "p_WB_W", "v_WB_W", "b_a", "b_g")}
         described["prior"] = {"t_ns": int(log.prior.t_ns), **vectors, "P": log.prior.P.tolist()}
     check_description(described, str(folder))
+    text = yaml.safe_dump(described, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    files: dict[str, Callable[[Any], object]] = {
+        f"{name}.{fmt}": partial(table.to_parquet, index=False)
+        if fmt == "parquet"
+        else partial(table.to_csv, index=False, mode="wb")
+        for name, table in tables.items()
+    }
+    files["log.yaml"] = lambda file: file.write(text.encode())
     try:
-        for name in ("log.yaml", *(f"{name}.{fmt}" for name in tables)):
-            if (folder / name).exists():
-                raise DatasetError(f"{folder}: holds a {name} already; choose another folder, or remove that one")
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, table in tables.items():
-            if fmt == "parquet":
-                table.to_parquet(folder / f"{name}.{fmt}", index=False)
-            else:
-                table.to_csv(folder / f"{name}.{fmt}", index=False)
-        text = yaml.safe_dump(described, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-        (folder / "log.yaml").write_text(text, encoding="utf-8")
+        _write_new(folder, files)
     except OSError as error:
         raise DatasetError(f"{folder}: cannot be written: {error}") from None
     return folder
+
+
+def _write_new(folder: Path, files: Mapping[str, Callable[[Any], object]]) -> None:
+    """Write files that are not there yet: all, or none where one fails.
+
+    Raises:
+        DatasetError: one of them is there, be it a link that leads nowhere.
+    """
+    for name in reversed(files):
+        if os.path.lexists(folder / name):
+            raise DatasetError(f"{folder}: holds a {name} already; choose another folder, or remove that one")
+    folder.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    try:
+        for name, write in files.items():
+            with (folder / name).open("xb") as file:  # x: not what came there meanwhile
+                written.append(folder / name)
+                write(file)
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
 
 
 def _table(stream: ReadingStream) -> pd.DataFrame:

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from ..errors import DatasetError, nearest
+from ..files import also_in
 from ..log import Log
 from .conversion import build_log
 from .description import read_description
@@ -33,22 +34,26 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
         repair: drop rows that are not finite or out of order, at most half of a stream, and count them in the log's
             notes, instead of an error.
 
+    A description names files in its folder, or in the data folder; it reads no others.
+
     Raises:
         RecordingNotFound: the catalog entry is known, its recording is missing.
         DatasetError: anything else, naming what, where, and the nearest known name.
     """
     path = Path(name_or_folder)
+    root = data if data is not None else os.environ.get("FATHOM_DATA") or None
     try:
-        if (path / "log.yaml").is_file():
-            return build_log(read_description(path / "log.yaml"), path, repair=repair)
-        if path.suffix == ".yaml" and path.is_file():
-            folder = path.parent if data is None else Path(data)
-            return build_log(read_description(path), folder, repair=repair)
-        if str(name_or_folder) in catalog_names():
-            return _open_catalogued(str(name_or_folder), data, repair=repair)
-        is_folder = path.is_dir()
-        if is_folder and path.resolve().name in catalog_names():  # the recording's own folder
-            return build_log(read_description(CATALOG / f"{path.resolve().name}.yaml"), path, repair=repair)
+        with also_in(None if root is None else Path(root)):
+            if (path / "log.yaml").is_file():
+                return build_log(read_description(path / "log.yaml"), path, repair=repair)
+            if path.suffix == ".yaml" and path.is_file():
+                folder = path.parent if data is None else Path(data)
+                return build_log(read_description(path), folder, repair=repair)
+            if str(name_or_folder) in catalog_names():
+                return _open_catalogued(str(name_or_folder), data, repair=repair)
+            is_folder = path.is_dir()
+            if is_folder and path.resolve().name in catalog_names():  # the recording's own folder
+                return build_log(read_description(CATALOG / f"{path.resolve().name}.yaml"), path, repair=repair)
     except (OSError, ValueError) as error:
         if isinstance(error, DatasetError):
             raise

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..places import angle, on_earth, radians, sexagesimal, turned_by
+from ..places import angle, is_place, radians, sexagesimal, turned_by
 from ..state import Array
 from . import description as d
 from .geodesy import SEMI_MAJOR_M, ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
@@ -62,7 +62,7 @@ def _locate(rows: Rows, part: d.Geodetic) -> None:
             f"{rows.stream}: all places are taken for north and east, since {part.unit} has no sign; `north_south` and "
             "`east_west` name the columns of hemispheres, and `scale: [1, -1]` turns east to west"
         )
-    there = on_earth(np.degrees(latitude), np.degrees(longitude))
+    there = is_place(np.degrees(latitude), np.degrees(longitude))
     zero = (latitude == 0) & (longitude == 0)
     nowhere = zero & _away_from_zero(latitude, longitude, there & ~zero)
 

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..files import regular_file
+from ..files import inside
 from .parquet import check_size, unpacked
 from .table import Column, Columns, Flaws, Table, check_columns, short
 from .text_table import PIECE_BYTES, PIECE_ROWS, text_pieces
@@ -48,7 +48,7 @@ def read_table(
     """
     if table.file is None:
         return _read_arrays(folder, table.arrays, [*columns, *texts], texts)
-    path = regular_file(folder / table.file)
+    path = inside(folder, table.file)
     wanted = dict.fromkeys([*columns, *texts])
     found = Flaws() if flaws is None else flaws
     try:
@@ -100,7 +100,7 @@ def _read_arrays(
     folder: Path, arrays: Mapping[str, str], wanted: Collection[Column], texts: Collection[Column]
 ) -> Columns:
     """Read NumPy arrays of equal length; `name.0`, `name.1` are the columns of a two-dimensional one."""
-    opened = {name: _array(regular_file(folder / file)) for name, file in arrays.items()}
+    opened = {name: _array(inside(folder, file)) for name, file in arrays.items()}
     lengths = {name: len(values) for name, values in opened.items()}
     if len(set(lengths.values())) > 1:
         raise DatasetError(f"{folder}: the arrays must be of equal length, found {lengths}")

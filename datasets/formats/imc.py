@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiled import compiled
-from ..errors import DatasetError, nearest, nearest_file
+from ..errors import DatasetError, nearest
+from ..files import inside
 from .recording import Messages, Recording, TopicInfo, Wanted, not_found
 
 HEADER = np.dtype(
@@ -167,9 +168,7 @@ def _columns(rows: NDArray[Any], want: Wanted, where: str) -> dict[str, NDArray[
 @contextmanager
 def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
     """Open a file, or a member of an archive, as a stream of bytes; decompressed if its name ends in .gz."""
-    path = folder / file
-    if not path.is_file():
-        raise DatasetError(f"{path}: no such file{nearest_file(path)}")
+    path = inside(folder, file)
     archive = None
     try:
         if path.suffix == ".zip":

@@ -55,7 +55,7 @@ def read_known(path: Path, names: Collection[str]) -> pd.DataFrame:
     """
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path) as file:
+    with path.open("rb") as raw, pq.ParquetFile(raw) as file:
         found = [name for name in file.schema_arrow.names if name in names]
         check_size(path, file, found)
         return file.read(columns=found).to_pandas(ignore_metadata=True)

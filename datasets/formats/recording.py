@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from ..errors import DatasetError, nearest, not_loaded
-from ..files import regular_file
+from ..files import inside
 
 LOADERS = {
     "ardupilot": "ardupilot:ArduPilotRecording",
@@ -107,9 +107,9 @@ class Recording(BaseModel):
         """Return the path of the recording.
 
         Raises:
-            DatasetError: it does not exist (with the nearest file that does), or is no file or folder.
+            DatasetError: it does not exist (with the nearest file that does), is no file or folder, or lies elsewhere.
         """
-        return regular_file(folder / self.file, or_folder=True)
+        return inside(folder, self.file, or_folder=True)
 
 
 def known_formats() -> list[str]:

@@ -20,6 +20,7 @@ from typing import IO, Any
 import yaml
 
 from ..errors import DatasetError, nearest, nearest_file
+from ..files import inside
 from .mcap_file import mcap_messages
 from .recording import extra
 from .ros_messages import Definition, Definitions, Types, definitions_of, parse_definitions, ros_channel, short_name
@@ -66,11 +67,11 @@ def own_definitions(folder: Path, files: Sequence[str]) -> dict[str, Definition]
     """Return the definitions in the user's files."""
     types: dict[str, Definition] = {}
     for file in files:
-        path = folder / file
+        path = inside(folder, file)
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, ValueError) as error:
-            raise DatasetError(f"{path}: cannot be read: {error}{nearest_file(path, folders=True)}") from None
+            raise DatasetError(f"{path}: cannot be read: {error}") from None
         packages = [part for part in path.resolve().parts[:-1] if part != "msg"]
         read = parse_definitions(text, f"{packages[-1]}/{path.stem}", str(path))
         types |= {kind: fields for kind, fields in read.items() if fields or "MSG:" not in text}
@@ -277,6 +278,8 @@ def _decompressed(compression: bytes, data: bytes) -> bytes:
 def _ros2_messages(
     path: Path, types: Types, distro: str | None, topics: Collection[str] | None, found: ScanResult
 ) -> Iterator[Message]:
+    for part in path.iterdir() if path.is_dir() else ():
+        inside(path, part.name, or_folder=True)
     about = _metadata(path) if path.is_dir() else {}
     files = _files(path, about) if path.is_dir() else [path]
     known = Definitions(types, _Distribution(distro, str(about.get("ros_distro")), str(path)))

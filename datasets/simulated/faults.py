@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
-from ..quantities import DEGREE, STRICT, Finite, NotNegative, Positive, Probability, Vector
+from ..quantities import DEGREE, STRICT, Finite, NotNegative, Number, Positive, Probability, Vector
 from ..rig import Mounting
 from ..state import Array, TimeArray
 from .random_streams import random_stream
@@ -30,7 +30,7 @@ def _in_order(interval: tuple[float, float]) -> tuple[float, float]:
 
 
 Interval = Annotated[tuple[Finite, Finite], AfterValidator(_in_order)]
-ClockOffset = Annotated[float, Field(ge=-LONGEST_CLOCK_OFFSET_S, le=LONGEST_CLOCK_OFFSET_S)]
+ClockOffset = Annotated[Number, Field(ge=-LONGEST_CLOCK_OFFSET_S, le=LONGEST_CLOCK_OFFSET_S)]
 
 
 class Marring(NamedTuple):

@@ -17,7 +17,8 @@ TOLD = {
 
 def scenario_notes(scenario: Scenario) -> list[str]:
     """Return sentences on the world, and on each sensor's settings, delays and faults, where there are any."""
-    return [*_world(scenario), *_biases(scenario), *_sensors(scenario), *_late(scenario), *_faults(scenario)]
+    parts = (_world, _mountings, _biases, _sensors, _late, _faults)
+    return [note for part in parts for note in part(scenario)]
 
 
 def _world(scenario: Scenario) -> list[str]:
@@ -26,6 +27,11 @@ def _world(scenario: Scenario) -> list[str]:
         for name in ("seabed", "waves", "tide")
         if (part := getattr(scenario, name)) is not None
     ]
+
+
+def _mountings(scenario: Scenario) -> list[str]:
+    aboard = {sensor: getattr(getattr(scenario, sensor), "mounting", None) for sensor in ("imu", *SENSORS)}
+    return [note for sensor, spec in aboard.items() if spec is not None for note in spec.notes(sensor)]
 
 
 def _biases(scenario: Scenario) -> list[str]:

@@ -46,8 +46,12 @@ def follow(scenario: Scenario, path: Trajectory | None = None) -> Motion:
         if scenario.path is None:
             raise DatasetError("simulate: mission 'recorded' needs `path`, a TUM file, or a Trajectory")
         source = scenario.path
-        path = Trajectory.from_tum(source)
+        path = Trajectory.from_tum(source, quoting=False)  # the scenario may be somebody else's, and name any file
         digest = f", sha256 {hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]}"
+    try:
+        path = path.with_rotations()
+    except DatasetError as error:
+        raise DatasetError(f"{source}: {error}") from None
     t_s = (path.t_ns - path.t_ns[0]) * 1e-9 - scenario.path_start_s
     _check_cover(source, t_s, scenario)
     poses = np.hstack([path.p_WB_W, _euler_angles(source, path)])
@@ -60,6 +64,7 @@ def follow(scenario: Scenario, path: Trajectory | None = None) -> Motion:
         notes=(
             f"Path: {source}{digest}, {len(path)} poses, from {scenario.path_start_s:g} s after the first; the splines "
             f"pass them at {math.sqrt(np.mean(off_m**2)):.3g} m rms, {off_m.max():.3g} m at most.",
+            *path.notes,
         ),
     )
     _check_motion(source, motion, scenario)
@@ -84,9 +89,6 @@ def _euler_angles(source: str, path: Trajectory) -> Array:
     bad = np.flatnonzero(~(np.isfinite(path.p_WB_W).all(axis=1) & np.isfinite(R).all(axis=(1, 2))))
     if len(bad):
         raise DatasetError(f"{source}: pose {bad[0]} ({len(bad)} in all) is not finite")
-    bad = np.flatnonzero(np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 1e-6)
-    if len(bad):
-        raise DatasetError(f"{source}: pose {bad[0]} ({len(bad)} in all): R_WB is not a rotation")
     bad = np.flatnonzero(np.abs(R[:, 2, 0]) > math.sin(math.radians(STEEPEST_DEG)))
     if len(bad):
         raise DatasetError(
@@ -106,6 +108,8 @@ def _euler_angles(source: str, path: Trajectory) -> Array:
 def _lay(source: str, t_s: Array, poses: Array, spacing_s: float | None) -> BSpline:
     if spacing_s is None:
         return make_interp_spline(t_s, poses, k=DEGREE_OF_SPLINES)
+    if (t_s[-1] - t_s[0]) > spacing_s * len(t_s):
+        raise _too_few(source, t_s, spacing_s)
     count = max(1, round((t_s[-1] - t_s[0]) / spacing_s))
     breaks = np.linspace(t_s[0], t_s[-1], count + 1)
     empty = np.flatnonzero(np.histogram(t_s, breaks)[0] == 0)
@@ -118,9 +122,13 @@ def _lay(source: str, t_s: Array, poses: Array, spacing_s: float | None) -> BSpl
     try:
         return make_lsq_spline(t_s, poses, knots, k=DEGREE_OF_SPLINES)
     except (ValueError, np.linalg.LinAlgError):
-        raise DatasetError(
-            f"{source}: {len(t_s)} poses are too few for knots every {spacing_s:g} s; make path_spacing_s longer"
-        ) from None
+        raise _too_few(source, t_s, spacing_s) from None
+
+
+def _too_few(source: str, t_s: Array, spacing_s: float) -> DatasetError:
+    return DatasetError(
+        f"{source}: {len(t_s)} poses are too few for knots every {spacing_s:g} s; make path_spacing_s longer"
+    )
 
 
 def _columns(spline: BSpline, columns: slice) -> BSpline:

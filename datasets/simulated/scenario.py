@@ -13,13 +13,14 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 from pydantic.dataclasses import dataclass
 
 from ..errors import DatasetError, complaints, nearest
-from ..places import Latitude
-from ..quantities import STRICT, Finite, NotNegative, Positive
-from ..rig import ImuNoise, Mounting, Rig
+from ..quantities import STRICT, Finite, Latitude, NotNegative, Number, Positive, Whole
+from ..rig import LEAST_GRAVITY, MOST_GRAVITY, ImuNoise, Mounting, Rig
 from ..state import Array
 from .faults import AnyFaults, true_mounting
 from .seabed import SeabedSpec
 from .specs import (
+    DEEPEST_M,
+    LONGEST_S,
     MISSIONS,
     RECORDED,
     SENSORS,
@@ -33,6 +34,12 @@ from .specs import (
     WavesSpec,
 )
 
+MOST_READINGS = 10_000_000
+"""Of one sensor: 28 h at 100 Hz. While an IMU is simulated each needs about 600 bytes."""
+MOST_TURNS = 1_000_000
+"""Of a mission: one a second for the longest."""
+FASTEST_M_S = 100.0
+"""No vehicle is as fast under water."""
 CLEARANCE_M = 0.5
 """Least height of a mission's deepest point above the seabed."""
 
@@ -74,21 +81,21 @@ class Scenario:
     """
 
     mission: str = "lawnmower"  # a name in MISSIONS, or "recorded"
-    duration_s: Annotated[float, Field(ge=20, le=1e6)] = 600.0
+    duration_s: Annotated[Number, Field(ge=20, le=LONGEST_S)] = 600.0
     imu: Imu = ImuSpec()  # or its noise alone: "tactical"
 
     # the path
-    speed_m_s: Positive = 1.5
-    depth_m: Positive = 20.0  # where level missions run, and yo-yo and helix turn upwards
+    speed_m_s: Annotated[Positive, Field(le=FASTEST_M_S)] = 1.5
+    depth_m: Annotated[Positive, Field(le=DEEPEST_M)] = 20.0  # of level missions; yo-yo and helix turn upwards there
     shallow_m: NotNegative = 5.0  # where yo-yo and helix turn downwards
-    climb_deg: Annotated[float, Field(gt=0, le=45)] = 20.0  # of every climb and dive, but the helix's
+    climb_deg: Annotated[Number, Field(gt=0, le=45)] = 20.0  # of every climb and dive, but the helix's
     helix_pitch_m: Positive = 10.0  # depth that one turn of the helix gains
     leg_m: Positive = 100.0
     turn_radius_m: Positive = 10.0
     course_deg: Finite = 30.0  # of the first leg
-    surface_every_s: Positive = 270.0
+    surface_every_s: Annotated[Positive, Field(ge=1)] = 270.0
     surface_for_s: Positive = 36.0  # half of it at the start and at the end
-    wobble_deg: Annotated[float, Field(ge=0, le=10)] = 1.5  # of roll, pitch and yaw, about the path's own
+    wobble_deg: Annotated[Number, Field(ge=0, le=10)] = 1.5  # of roll, pitch and yaw, about the path's own
 
     # a recorded path: east-north-up, its z = 0 at the surface; all but the vehicle and the sensors is then in the file
     path: str | None = None  # a TUM file; relative to where the command runs
@@ -102,7 +109,7 @@ class Scenario:
     tide: TideSpec | None = None
 
     # the vehicle
-    gravity_m_s2: Annotated[float, Field(gt=9.7, lt=9.9)] = 9.81
+    gravity_m_s2: Annotated[Number, Field(gt=LEAST_GRAVITY, lt=MOST_GRAVITY)] = 9.81
 
     # the sensors
     dvl: DvlSpec | None = DvlSpec()
@@ -110,8 +117,9 @@ class Scenario:
     gps: GpsSpec | None = GpsSpec()
     heading: HeadingSpec | None = HeadingSpec()
     prior: PriorSpec = PriorSpec()
-    noise_scale: NotNegative = 1.0  # of every random error, the prior's too; what is stated stays. 0: none
-    start_ns: Annotated[int, Field(ge=0, le=4_000_000_000_000_000_000)] = 0
+    # of every random error, the prior's too; what is stated stays. 0: none
+    noise_scale: Annotated[NotNegative, Field(le=1e6)] = 1.0
+    start_ns: Annotated[Whole, Field(ge=0, le=4_000_000_000_000_000_000)] = 0
 
     @field_validator("mission")
     @classmethod
@@ -133,6 +141,23 @@ class Scenario:
             raise ValueError(
                 f"helix: helix_pitch_m {self.helix_pitch_m:g} climbs at more than 45°; at most 2π · turn_radius_m"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _fits_into_memory(self) -> Scenario:
+        aboard = {sensor: getattr(self, sensor) for sensor in ("imu", *SENSORS)}
+        for sensor, spec in aboard.items():
+            if spec is not None and spec.rate_hz * self.duration_s > MOST_READINGS:
+                raise ValueError(
+                    f"{sensor}.rate_hz {spec.rate_hz:g} over duration_s {self.duration_s:g} gives "
+                    f"{spec.rate_hz * self.duration_s:.2g} readings; at most {MOST_READINGS:,}"
+                )
+        if self.mission in MISSIONS:
+            plan = MISSIONS[self.mission]
+            round_m = plan.legs * len(plan.turns_deg) * self.leg_m
+            round_m += math.radians(sum(map(abs, plan.turns_deg))) * self.turn_radius_m
+            if self.speed_m_s * self.duration_s * len(plan.turns_deg) > MOST_TURNS * round_m:
+                raise ValueError(f"{self.mission}: more than {MOST_TURNS:,} turns; make leg_m or turn_radius_m longer")
         return self
 
     @model_validator(mode="after")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from ..quantities import STRICT, NotNegative, Positive
 from ..state import Array
+from .specs import DEEPEST_M
 
 STEEPEST = 0.2
 """Slope; up to it, `ranges` converges for every beam that points within 75° of straight down."""
@@ -22,7 +24,7 @@ ITERATIONS = 60
 class SeabedSpec:
     """Hills and hollows, relief_m high and relief_length_m from one to the next, about a depth below the surface."""
 
-    depth_m: Positive = 40.0
+    depth_m: Annotated[Positive, Field(le=DEEPEST_M)] = 40.0
     relief_m: NotNegative = 0.0
     relief_length_m: Positive = 100.0
 

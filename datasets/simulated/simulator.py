@@ -26,10 +26,10 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         path: what the mission "recorded" follows, in place of the scenario's file.
 
     Raises:
-        DatasetError: the seed is negative, or no vehicle can follow the path.
+        DatasetError: the seed is negative or has more than 63 bits, or no vehicle can follow the path.
     """
-    if seed < 0:
-        raise DatasetError(f"simulate: seed must not be negative, found {seed}")
+    if not 0 <= seed < 1 << 63:
+        raise DatasetError("simulate: seed must be from 0 to 2^63 − 1")
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
     edges_ns = np.concatenate([[0], ticks(scenario.imu.rate_hz, scenario.duration_s)])
     biases = simulate_biases(rig.imu_noise, edges_ns, seed, scenario.imu.bias_correlation_s) * scenario.noise_scale

@@ -11,11 +11,15 @@ from pydantic.dataclasses import dataclass
 
 from ..errors import nearest
 from ..mounting import MountingSpec
-from ..quantities import STRICT, Finite, NotNegative, Positive, Probability
+from ..quantities import STRICT, Finite, NotNegative, Number, Positive, Probability
 from ..rig import ImuNoise
 from .faults import DepthFaults, DvlFaults, GpsFaults, HeadingFaults, ImuFaults
 from .imu_grades import IMU_GRADES
 
+LONGEST_S = 1e6
+"""Of a mission, and of a delay: eleven days."""
+DEEPEST_M = 11_000.0
+"""The deepest sea is 10.9 km deep."""
 STEEPEST = 1 / 15
 """Significant height over the length of the peak's wave: steeper seas break."""
 
@@ -53,7 +57,7 @@ class WavesSpec:
     """A sea state: significant height, period of the spectrum's peak, and where the waves run (from east, to north)."""
 
     height_m: Positive = 0.5
-    period_s: Annotated[float, Field(ge=4, le=30)] = 6.0
+    period_s: Annotated[Number, Field(ge=4, le=30)] = 6.0
     towards_deg: Finite = 0.0
 
     @model_validator(mode="after")
@@ -71,11 +75,12 @@ class WavesSpec:
 class TideSpec:
     """A rise and fall of the water, from z = 0 at the log's start; its phase there is 0 where it rises fastest."""
 
-    amplitude_m: Positive = 1.0
-    period_h: Positive = 12.42
+    amplitude_m: Annotated[Positive, Field(le=10)] = 1.0
+    period_h: Annotated[Positive, Field(ge=0.1)] = 12.42
     phase_deg: Finite = 0.0
 
 
+Delay = Annotated[NotNegative, Field(le=LONGEST_S)]
 Noise = Annotated[
     Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
     Discriminator(lambda noise: "grade" if isinstance(noise, str) else "figures"),
@@ -120,14 +125,14 @@ class DvlSpec:
 
     rate_hz: Positive = 5.0
     beam_sigma_m_s: Positive = 0.005
-    beam_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
+    beam_angle_deg: Annotated[Number, Field(gt=0, lt=90)] = 22.5  # from B's downward axis
     min_range_m: NotNegative = 0.05  # along each beam, where there is a seabed
     max_range_m: Positive = 50.0
-    max_tilt_deg: Annotated[float, Field(gt=0, lt=90)] | None = None  # of its axis from the vertical
+    max_tilt_deg: Annotated[Number, Field(gt=0, lt=90)] | None = None  # of its axis from the vertical
     beam_loss_probability: Probability = 0.0  # of each beam of each reading
     three_beams: bool = True  # whether three beams are enough for a reading
-    delay_s: NotNegative = 0.0
-    disorder_s: NotNegative = 0.0
+    delay_s: Delay = 0.0
+    disorder_s: Delay = 0.0
     faults: DvlFaults = DvlFaults()
 
 
@@ -137,8 +142,8 @@ class DepthSpec:
 
     rate_hz: Positive = 10.0
     sigma_m: Positive = 0.02
-    delay_s: NotNegative = 0.0
-    disorder_s: NotNegative = 0.0
+    delay_s: Delay = 0.0
+    disorder_s: Delay = 0.0
     mounting: MountingSpec = MountingSpec((0.40, -0.06, 0.05))
     faults: DepthFaults = DepthFaults()
 
@@ -151,8 +156,8 @@ class GpsSpec:
     horizontal_sigma_m: Positive = 1.5
     vertical_sigma_m: Positive = 3.0
     reacquisition_s: NotNegative = 0.0  # from when the antenna leaves the water to the first fix; it begins with one
-    delay_s: NotNegative = 0.0
-    disorder_s: NotNegative = 0.0
+    delay_s: Delay = 0.0
+    disorder_s: Delay = 0.0
     mounting: MountingSpec = MountingSpec((-0.25, 0.0, 0.30))
     faults: GpsFaults = GpsFaults()
 
@@ -169,8 +174,8 @@ class HeadingSpec:
     bias_deg: Finite = 0.0
     soft_iron_deg: NotNegative = 0.0
     soft_iron_axis_deg: Finite = 0.0
-    delay_s: NotNegative = 0.0
-    disorder_s: NotNegative = 0.0
+    delay_s: Delay = 0.0
+    disorder_s: Delay = 0.0
     mounting: MountingSpec = MountingSpec((0.55, 0.0, 0.05), roll_deg=1.5, pitch_deg=-2.0, yaw_deg=4.0)
     faults: HeadingFaults = HeadingFaults()
 

@@ -17,6 +17,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from ...datasets.epochs import SENSOR, Epoch
+from ...datasets.quantities import NotNegative, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ...datasets.trajectory import Trajectory
@@ -45,8 +46,8 @@ class FilterOptions:
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     gate: Gate = Field(default_factory=dict)
-    max_delay_s: float = Field(default=5.0, ge=0, allow_inf_nan=False)
-    merge_ns: int = Field(default=1_000_000, ge=0)
+    max_delay_s: NotNegative = 5.0
+    merge_ns: Whole = Field(default=1_000_000, ge=0)
     earth_rotation: bool = False
 
 

@@ -21,6 +21,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from ...datasets.compiled import compiled
+from ...datasets.quantities import NotNegative, Number
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Array, Belief
 from ..interface import Diverged
@@ -41,8 +42,8 @@ class UnscentedKalmanFilter(FilterOptions):
         beta: adjusts the covariance weight of the central point for the fourth moments; 2 for a Gaussian.
     """
 
-    alpha: float = Field(default=0.3, ge=1e-3, le=1)
-    beta: float = Field(default=2.0, ge=0, allow_inf_nan=False)
+    alpha: Number = Field(default=0.3, ge=1e-3, le=1)
+    beta: NotNegative = 2.0
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""

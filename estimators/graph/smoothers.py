@@ -10,10 +10,11 @@ import gtsam
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from ...datasets.quantities import NotNegative, Positive, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ..interface import Pass
-from ..smoothers import GraphSmoother, LaggedSmoother, NonNegative, Positive
+from ..smoothers import GraphSmoother, LaggedSmoother
 from .graph_pass import GraphPass
 from .solvers import BatchLagSolver, IncrementalSolver, Solver, isam2_params
 
@@ -52,9 +53,9 @@ class IncrementalSmoother(GtsamSmoother):
         extra_updates: Gauss–Newton steps after the one that takes in new factors.
     """
 
-    relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)
-    wildfire: NonNegative = 1e-3
-    extra_updates: Annotated[int, Field(ge=0)] = 0
+    relinearize: tuple[NotNegative, NotNegative, NotNegative, NotNegative] = (0.005, 10.0, 0.05, 1.0)
+    wildfire: NotNegative = 1e-3
+    extra_updates: Annotated[Whole, Field(ge=0)] = 0
 
     def isam2_params(self) -> gtsam.ISAM2Params:
         """Return iSAM2's parameters."""

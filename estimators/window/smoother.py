@@ -7,10 +7,11 @@ from typing import Annotated
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from ...datasets.quantities import NotNegative, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Belief
 from ..interface import Pass
-from ..smoothers import LaggedSmoother, NonNegative
+from ..smoothers import LaggedSmoother
 from .window_pass import Solving, WindowPass
 
 
@@ -30,8 +31,8 @@ class WindowSmoother(LaggedSmoother):
         relinearize_prior: also relinearise the keyframe that the marginal prior is on. GTSAM's smoothers do not.
     """
 
-    relinearize: tuple[NonNegative, NonNegative, NonNegative, NonNegative] = (0.005, 10.0, 0.05, 1.0)
-    extra_updates: Annotated[int, Field(ge=0)] = 0
+    relinearize: tuple[NotNegative, NotNegative, NotNegative, NotNegative] = (0.005, 10.0, 0.05, 1.0)
+    extra_updates: Annotated[Whole, Field(ge=0)] = 0
     relinearize_prior: bool = False
 
     def begin(self, prior: Belief, rig: Rig) -> Pass:

@@ -178,3 +178,23 @@ def test_a_cache_that_cannot_be_written_costs_no_run(monkeypatch: pytest.MonkeyP
 
     assert twice(2.0) == 4.0
     assert "cannot be kept (No space left on device)" in caplog.text
+
+
+def test_without_any_place_to_write_functions_are_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, caplog: Any, tmp_path: Path
+) -> None:
+    def nowhere(*_: object, **__: object) -> str:
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
+    monkeypatch.setattr("tempfile.mkdtemp", nowhere)
+    for function in (compiled_cache.compiled_folder, compiled_cache.temporary_folder):
+        monkeypatch.setattr(compiled_cache, function.__name__, function.__wrapped__)  # not what this process found
+
+    @compiled
+    def twice(x: float) -> float:
+        return 2.0 * x
+
+    assert twice(2.0) == 4.0
+    assert caplog.text.count("no folder can be written, not even a temporary one") == 1

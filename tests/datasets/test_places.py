@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from fathom.datasets import DatasetError, ImuNoise, Rig, Scenario
 from fathom.datasets.described.description import Origin
-from fathom.datasets.places import angle, on_earth, radians, turned_by
+from fathom.datasets.places import angle, is_place, radians, turned_by
 from pydantic import ValidationError
 
 PLACE = 41.184999
@@ -41,7 +41,7 @@ def test_south_is_negative(text):
     "text", ["", "-", "N", "41E", "-41S", "N41N", "41 60 N", "41 11 60", "abc", "41,18", "41 11 5 3", "9" * 50]
 )
 def test_what_says_no_place_is_nan(text):
-    assert not on_earth(np.degrees(angle(text, "deg", "NS")))
+    assert not is_place(np.degrees(angle(text, "deg", "NS")))
 
 
 def test_columns_of_hemispheres_give_the_sign_and_may_not_contradict():
@@ -50,10 +50,10 @@ def test_columns_of_hemispheres_give_the_sign_and_may_not_contradict():
     np.testing.assert_array_equal(found, [8.7, -8.7, -8.7, np.nan, np.nan, np.nan])
 
 
-def test_the_poles_and_a_whole_turn_are_on_earth_and_nothing_beyond():
+def test_the_poles_and_a_whole_turn_are_is_place_and_nothing_beyond():
     latitude = np.degrees(radians(np.array([90.0, -90.0, 90.1, np.nan, 0, 0]), "deg"))
     longitude = np.degrees(radians(np.array([0.0, 0, 0, 0, 360.0, 361.0]), "deg"))
-    assert on_earth(latitude, longitude).tolist() == [True, True, False, False, True, False]
+    assert is_place(latitude, longitude).tolist() == [True, True, False, False, True, False]
 
 
 def test_a_rig_a_scenario_and_an_origin_ask_the_same():

@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from ....datasets.errors import shown
 from ...drawing import looks_of
 from ...errors import ExperimentError
 from ...files import write_whole, writing
@@ -108,7 +109,12 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
     name = str(every[0]["experiment"] or folder.name)
     plan, again = kept_plan(folder, name)
     templates = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: shown(value) if type(value) is str else value,
     )
     templates.filters["ordinal"] = ordinal
     return templates.get_template("page.html").render(
@@ -166,18 +172,23 @@ def ordinal(k: int) -> str:
 
 
 def embedded(value: Any) -> Any:
-    """Return a value as JSON for a script element, which no text in it can end; non-finite numbers are null."""
+    """Return a value as JSON for a script element, which no text in it can end.
+
+    Non-finite numbers are null, and text is as `shown` gives it.
+    """
     from markupsafe import Markup
 
-    text = json.dumps(_finite(value), separators=(",", ":"))
+    text = json.dumps(_plain(value), separators=(",", ":"))
     return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
 
 
-def _finite(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {shown(str(key)): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [_plain(item) for item in value]
+    if isinstance(value, str):
+        return shown(value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -10,7 +10,7 @@ import yaml
 from ....datasets.errors import nearest
 from ...errors import ExperimentError
 from ...experiment.plan import Experiment, plain, shipped_experiments
-from ...files import writing
+from ...files import from_csv, writing
 from ...results.summary import Record, records
 
 PLAN = "experiment.yaml"
@@ -90,6 +90,8 @@ def differences_of(folder: Path) -> list[Record]:
     if not path.is_file():
         return []
     try:
-        return records(pd.read_csv(path, dtype=dict.fromkeys(NAMES, str), keep_default_na=False, na_values=[""]))
+        table = pd.read_csv(path, dtype=dict.fromkeys(NAMES, str), keep_default_na=False, na_values=[""])
     except (OSError, ValueError) as error:
         raise ExperimentError(f"{path}: cannot be read ({' '.join(str(error).split())})") from None
+    names = {name: table[name].map(from_csv, na_action="ignore") for name in NAMES if name in table}
+    return records(table.assign(**names))

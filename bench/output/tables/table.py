@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ...files import write_csv
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, groups, is_judged, records, summarise
@@ -26,17 +27,17 @@ ANY_WIDTH = 10_000
 
 def write_table(rows: pd.DataFrame, path: Path) -> None:
     """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field."""
-    pd.DataFrame(summarise_with_intervals(rows)).to_csv(path, index=False)
+    write_csv(pd.DataFrame(summarise_with_intervals(rows)), path)
 
 
 def write_consistency(rows: pd.DataFrame, path: Path) -> None:
     """Write what `consistency` returns as CSV."""
-    pd.DataFrame(consistency_of(rows), columns=list(CONSISTENCY)).to_csv(path, index=False)
+    write_csv(pd.DataFrame(consistency_of(rows), columns=list(CONSISTENCY)), path)
 
 
 def write_paired(differences: Sequence[Record], path: Path) -> None:
     """Write what `paired` returns as CSV."""
-    pd.DataFrame(differences, columns=list(PAIRED)).to_csv(path, index=False)
+    write_csv(pd.DataFrame(differences, columns=list(PAIRED)), path)
 
 
 def print_table(rows: pd.DataFrame, console: Console | None = None, differences: Sequence[Record] = ()) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
+
+from ....datasets.errors import shown
 
 WIDTH = 120
 """Columns of output to a file or a pipe: enough for the tables of README."""
@@ -21,7 +25,27 @@ LONGEST_WORD = 32
 def console() -> Console:
     """Return a console on standard output."""
     there = Console()
-    return there if there.is_terminal else Console(width=WIDTH)
+    there = there if there.is_terminal else Console(width=WIDTH)
+    there.push_render_hook(Plain())
+    return there
+
+
+class Plain(RenderHook):
+    """Passes on all that a console prints with its text as `shown` gives it."""
+
+    def process_renderables(self, renderables: list[ConsoleRenderable]) -> list[ConsoleRenderable]:
+        """Return the same, each with plain text."""
+        return [_PlainText(each) for each in renderables]
+
+
+@dataclass(frozen=True)
+class _PlainText:
+    of: ConsoleRenderable
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Segment]:
+        for segment in console.render(self.of, options):
+            text = "\n".join(map(shown, segment.text.split("\n")))
+            yield segment if segment.control else segment._replace(text=text)
 
 
 def plain_table(heading: str, names: Iterable[str], title: str | None = None) -> Table:

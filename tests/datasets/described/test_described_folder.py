@@ -468,6 +468,18 @@ def test_a_folder_that_holds_a_log_is_not_written_over(tmp_path):
     assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
 
 
+def test_nothing_is_written_through_a_link_and_nothing_stays_of_what_fails(tmp_path, monkeypatch):
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "dvl.parquet").symlink_to(tmp_path / "elsewhere.parquet")
+    with pytest.raises(DatasetError, match=r"holds a dvl.parquet already"):
+        write_folder(some_log(8), tmp_path / "log")
+    (tmp_path / "log" / "dvl.parquet").unlink()
+    monkeypatch.setattr("yaml.safe_dump", lambda *_, **__: "\udc80")  # the last file cannot be written
+    with pytest.raises(UnicodeEncodeError):
+        write_folder(some_log(8), tmp_path / "log")
+    assert not [*(tmp_path / "log").iterdir(), *tmp_path.glob("elsewhere*")]
+
+
 PRIOR: dict[str, Any] = {
     "t_ns": 100 * 10**9,
     "R_WB": np.eye(3).tolist(),
@@ -569,8 +581,8 @@ def test_a_truth_without_rows_is_refused(folder):
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("R_WB_00", 5.0, r"truth.csv: row 3 \(1 in all\): R_WB is not a rotation"),
-        ("R_WB_00", np.nan, r"truth.csv: row 3 \(1 in all\): R_WB is not a rotation"),
+        ("R_WB_00", 5.0, r"truth.csv: trajectory: row 3 \(1 in all\): R_WB is not a rotation"),
+        ("R_WB_00", np.nan, r"truth.csv: trajectory: row 3 \(1 in all\): R_WB is not a rotation"),
         ("t_ns", np.nan, r"truth.csv: trajectory: row 3: t_ns is nan, not a time"),
         ("t_ns", -9e18, r"truth.csv: trajectory: row 3: t_ns is -9e\+18, not a time"),
         ("p_WB_W_x", None, r"truth.csv: trajectory: missing columns: p_WB_W_x"),
@@ -672,7 +684,7 @@ def test_what_is_wrong_in_a_tum_file_names_the_file(tmp_path, text, message):
 def test_a_tum_file_that_cannot_be_read_is_one_line(tmp_path, name, why):
     with pytest.raises(DatasetError) as error:
         Trajectory.from_tum(tmp_path / name)
-    assert str(error.value) == f"{tmp_path / name}: {why}"
+    assert str(error.value) == f"{tmp_path / name}: {why}".replace("\0", r"\x00")
 
 
 def test_errors_of_the_rig_and_the_imu_name_the_log(folder):

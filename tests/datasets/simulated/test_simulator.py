@@ -344,6 +344,8 @@ def test_bad_arguments_are_refused():
     with pytest.raises(ValidationError, match="did you mean 'yo-yo'"):
         Scenario(mission="yoyo")
     with pytest.raises(ValidationError, match="gyro_density"):
+        Scenario(imu=ImuNoise(0.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+    with pytest.raises(DatasetError, match="gyro_density"):
         Scenario(imu=ImuNoise(-1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
     with pytest.raises(DatasetError, match="seed"):
         simulate(Scenario(duration_s=20), -1)
