@@ -21,6 +21,7 @@ from ..files import inside
 from ..formats.parquet import read_known
 from ..formats.text_table import EXACT
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, Log
+from ..notes import Note
 from ..rig import Rig
 from ..rotations import (
     complaint,
@@ -78,11 +79,11 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
-        opening.notes += (f"truth: {mended}" for mended in truth.notes)
+        opening.notes += (Note(f"truth: {mended}", "repaired", "truth") for mended in truth.notes)
     for name, part in description.parts.items():
         mounting = getattr(part, "mounting", None)
-        opening.notes += () if mounting is None else mounting.notes(name)
-    opening.notes += () if description.prior is None else description.prior.notes
+        opening.notes += (Note(text, "repaired", name) for text in (() if mounting is None else mounting.notes(name)))
+    opening.notes += (Note(text, "repaired") for text in (() if description.prior is None else description.prior.notes))
 
     with _named(folder):
         mountings = {
@@ -205,13 +206,13 @@ def _put_rotations(rows: Rows, part: d.Attitude, origin: tuple[float, float] | N
         off = off_rotation(R)
         good = is_rotation(off)
         rows.refuse(~good, lambda row: complaint(R[row]), "without a rotation")
-        rows.opening.notes += note(rows.stream, off[good])
+        rows.opening.notes += (Note(text, "repaired", rows.stream) for text in note(rows.stream, off[good]))
         R = orthonormalised(R[good], off[good])
     else:
         off = off_unit(values)
         good = is_rotation(off)
         rows.refuse(~good, lambda row: complaint_of_quaternion(values[row]), "without a unit quaternion")
-        rows.opening.notes += note(rows.stream, off[good])
+        rows.opening.notes += (Note(text, "repaired", rows.stream) for text in note(rows.stream, off[good]))
         q_xyzw = values[good] if part.form == "quaternion_xyzw" else np.roll(values[good], -1, axis=1)
         R = Rotation.from_quat(q_xyzw).as_matrix().reshape(-1, 3, 3)
     if part.world == "NED":

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..notes import Note
 from ..places import angle, is_place, radians, sexagesimal, turned_by
 from ..state import Array
 from . import description as d
@@ -58,10 +59,11 @@ def _locate(rows: Rows, part: d.Geodetic) -> None:
     longitude = _angle(rows, part.longitude, part.unit, float(scales[1]), "EW", part.east_west)
     rows.values |= {"latitude": latitude, "longitude": longitude}
     if part.signs_unsaid and len(latitude) and not (latitude < 0).any() and not (longitude < 0).any():
-        rows.opening.notes.append(
+        text = (
             f"{rows.stream}: all places are taken for north and east, since {part.unit} has no sign; `north_south` and "
             "`east_west` name the columns of hemispheres, and `scale: [1, -1]` turns east to west"
         )
+        rows.opening.notes.append(Note(text, "check", rows.stream))
     there = is_place(np.degrees(latitude), np.degrees(longitude))
     zero = (latitude == 0) & (longitude == 0)
     nowhere = zero & _away_from_zero(latitude, longitude, there & ~zero)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import DatasetError
 from ..formats.table import Columns, Flaws
 from ..log import is_noise
+from ..notes import Note
 from ..state import LIMIT_NS, Array, TimeArray
 from ..times import far, far_complaint, times_ns
 from . import description as d
@@ -74,7 +75,8 @@ class Rows:
         """Drop the rows of a mask, as the description says, and count them in the notes."""
         count = int(np.count_nonzero(mask))
         if count:
-            self.opening.notes.append(f"{self.stream}: {count} rows {what} dropped")
+            text = f"{self.stream}: {count} rows {what} dropped"
+            self.opening.notes.append(Note(text, "dropped", self.stream, count, self.total))
             self.total -= count
             self.keep(~mask)
 
@@ -116,7 +118,8 @@ class Rows:
         if self.complaints and not self.opening.repair:
             raise self.error(f"{self.complaints[0]}; --repair drops such rows")
         for what, count in self.reasons.items():
-            self.opening.notes.append(f"{self.stream}: {count} rows {what} (repair) dropped")
+            text = f"{self.stream}: {count} rows {what} (repair) dropped"
+            self.opening.notes.append(Note(text, "dropped", self.stream, count, self.total))
 
     def si(self, quantity: d.Quantity) -> Array:
         """Return (n, k): the quantity's columns in SI, in the axes of the source."""
@@ -248,7 +251,8 @@ def _use_valid(rows: Rows, valid: d.Valid) -> None:
     if len(good) and not good.any():
         found = ", ".join(dict.fromkeys(str(value)[:20] for value in values[:100].tolist()))
         wanted = ", ".join(f"{value:g}" if isinstance(value, float) else value for value in valid.values)
-        rows.opening.notes.append(f"{rows.stream}: no row is valid: column {column!r} holds {found}, never {wanted}")
+        text = f"{rows.stream}: no row is valid: column {column!r} holds {found}, never {wanted}"
+        rows.opening.notes.append(Note(text, "silent", rows.stream, len(good), len(good)))
     rows.leave_out(~good, "invalid")
 
 
@@ -286,7 +290,8 @@ def _align_counter(rows: Rows, time: d.Time) -> None:
         )
     if by:
         rows.t_ns, rows.received_ns = rows.t_ns + by * period_ns, rows.received_ns + by * period_ns
-        rows.opening.notes.append(f"{rows.stream}: moved by {by} periods of its counter, onto the IMU's time")
+        text = f"{rows.stream}: moved by {by} periods of its counter, onto the IMU's time"
+        rows.opening.notes.append(Note(text, "repaired", rows.stream))
 
 
 def _without_repeats(rows: Rows, part: Any, columns: Sequence[d.Column]) -> None:
@@ -302,10 +307,11 @@ def _without_repeats(rows: Rows, part: Any, columns: Sequence[d.Column]) -> None
         zero = np.all([each == 0 for each in values if each.dtype.kind != "T"], axis=0)
         share = np.count_nonzero(again & ~zero) / len(again)
         if share > REPEATED_SHARE and np.count_nonzero(~again) > CHANGES:
-            rows.opening.notes.append(
+            text = (
                 f"{rows.stream}: {share:.0%} of the rows have the values of the row before; if they were published "
                 "again, `drop_repeats: true` leaves them out"
             )
+            rows.opening.notes.append(Note(text, "check", rows.stream, int(np.count_nonzero(again)), len(again)))
 
 
 def _refuse_infinite(rows: Rows, columns: Sequence[d.Column]) -> None:

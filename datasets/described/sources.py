@@ -14,6 +14,7 @@ from ..errors import DatasetError
 from ..formats.columns import read_table
 from ..formats.recording import Recording, Wanted
 from ..formats.table import Columns, Flaws
+from ..notes import Note
 from ..state import Array, TimeArray
 from ..times import NS_PER
 from . import description as d
@@ -118,7 +119,7 @@ class Opening:
                     asked[part.message.names[which], part.message.entity][field_name] = None
         read = recording.read(self.folder, [Wanted(*key, tuple(columns)) for key, columns in asked.items()])
         self.messages = dict(zip(asked, read.columns, strict=True))
-        self.notes += read.notes
+        self.notes += [note if isinstance(note, Note) else Note(note, "damage") for note in read.notes]
 
 
 def _field(message: d.Message, column: str, recording: Recording, folder: Path) -> tuple[int, str]:
