@@ -228,8 +228,8 @@ def _timed(opening: Opening, stream: str, time: d.Time, raw: Columns, flaws: Fla
 def _sum_ns(raw: Columns, columns: tuple[d.Column, ...], time: d.Time) -> tuple[TimeArray, NDArray[np.bool_]]:
     """Return the times that columns add up to, with the wraps of their counter, and which rows have one."""
     parts = [times_ns(raw[column], unit) for column, unit in zip(columns, time.units, strict=True)]
-    t_ns, good = sum(ns for ns, _ in parts), np.all([fine for _, fine in parts], axis=0)
-    good &= np.abs(t_ns) < LIMIT_NS
+    t_ns: TimeArray = np.sum([ns for ns, _ in parts], axis=0)
+    good = np.all([fine for _, fine in parts], axis=0) & (np.abs(t_ns) < LIMIT_NS)
     if time.wraps_at_s is not None:
         t_ns[good] = unwrapped(t_ns[good], round(time.wraps_at_s * 1e9))
     return t_ns, good
