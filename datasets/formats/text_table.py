@@ -37,25 +37,25 @@ class _Lines(io.TextIOBase):
         self.file, self.table, self.flaws, self.ahead = file, table, flaws, ""
         self.separator, self.rows = separator_of(table), 0
         self.picked, self.width = list[int](), 0
+        self.comment = table.comment
         self.kinds = () if table.lines is None else table.lines.values  # noqa: PD011  (our own field)
+        self.kind_field = 0 if table.lines is None else table.lines.field
 
     def _counts(self, line: str) -> bool:
-        comment = self.table.comment
-        return bool(line.strip()) and not (comment and line.startswith(comment))
+        return bool(line.strip()) and not (self.comment and line.startswith(self.comment))
 
-    def _is_row(self, line: str) -> bool:
-        kind = self.table.lines
-        if not self._counts(line):
-            return False
-        if kind is None:
-            self.rows += 1
-            return True
-        fields = line.split(None if self.table.delimiter == "whitespace" else self.table.delimiter, kind.field + 1)
-        if len(fields) > kind.field and fields[kind.field].strip().strip('"') in self.kinds:
-            self.rows += 1
-            return True
-        self.flaws.other_lines += 1
-        return False
+    def _rows(self, lines: Iterable[str]) -> list[str]:
+        """Return the lines that are rows, and count them and the lines of other kinds."""
+        rows = list(filter(self._counts, lines))
+        if self.kinds:
+            rows, every = [row for row in rows if self._kind(row) in self.kinds], len(rows)
+            self.flaws.other_lines += every - len(rows)
+        self.rows += len(rows)
+        return rows
+
+    def _kind(self, line: str) -> str | None:
+        fields = line.split(None if self.separator == r"\s+" else self.table.delimiter, self.kind_field + 1)
+        return fields[self.kind_field].strip().strip('"') if len(fields) > self.kind_field else None
 
     def _separated(self, text: str) -> str:
         return text.replace(self.table.delimiter, SEPARATOR) if self.separator == SEPARATOR else text
@@ -66,13 +66,14 @@ class _Lines(io.TextIOBase):
 
     def first(self) -> str:
         """Return the next line of data; "" at the end."""
-        return self._separated(next(filter(self._is_row, self.file), ""))
+        return self._separated(next((row for line in self.file for row in self._rows([line])), ""))
 
     def read(self, size: int | None = -1) -> str:
         """Return some whole lines of data; "" at the end."""
         text, self.ahead = self._narrowed([self.ahead]), ""
         while not text and (lines := self.file.readlines(PIECE_BYTES)):
-            text = self._narrowed(map(self._separated, filter(self._is_row, lines)))
+            rows = self._rows(lines)
+            text = self._narrowed(map(self._separated, rows)) if self.width else self._separated("".join(rows))
         return text
 
     def fields(self, line: str) -> list[str]:
