@@ -7,16 +7,23 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import DatasetError
 from .rig import Rig
 from .rotations import UNHEARD, complaint, off_rotation
 from .state import Array, Belief, TimeArray
+from .times import far, far_complaint
 from .trajectory import Trajectory
 
 
+def is_noise(sigma: Array) -> NDArray[np.bool_]:
+    """Return (n,): whether all of a row's standard deviations (n, m) are positive."""
+    return (sigma > 0).all(axis=1)
+
+
 def check_rows(stream: str, t_ns: TimeArray, columns: Mapping[str, Array], *, strict: bool) -> None:
-    """Refuse times out of order and values that are not finite.
+    """Refuse times out of order, or far from all others, and values that are not finite.
 
     Args:
         stream: name used in the error.
@@ -32,17 +39,16 @@ def check_rows(stream: str, t_ns: TimeArray, columns: Mapping[str, Array], *, st
             raise DatasetError(f"{stream}: {len(t_ns)} times but {len(values)} rows of {name}")
         bad = np.flatnonzero(~np.isfinite(np.asarray(values).reshape(len(t_ns), -1)).all(axis=1)) if len(t_ns) else []
         if len(bad):
-            raise DatasetError(
-                f"{stream}: row {bad[0]} ({len(bad)} in all): {name} is {values[bad[0]]}; --repair drops such rows"
-            )
+            raise DatasetError(f"{stream}: row {bad[0]} ({len(bad)} in all): {name} is {values[bad[0]]}")
     step = np.diff(t_ns)
     bad = np.flatnonzero(step <= 0 if strict else step < 0)
     if len(bad):
         row = int(bad[0]) + 1
         how = "repeats" if step[row - 1] == 0 else "comes before"
-        raise DatasetError(
-            f"{stream}: row {row} ({len(bad)} in all): time {t_ns[row]} {how} the row above; --repair drops such rows"
-        )
+        raise DatasetError(f"{stream}: row {row} ({len(bad)} in all): time {t_ns[row]} {how} the row above")
+    bad = np.flatnonzero(far(t_ns))
+    if len(bad):
+        raise DatasetError(f"{stream}: row {bad[0]} ({len(bad)} in all): {far_complaint(t_ns, int(bad[0]))}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +106,7 @@ class ReadingStream:
                 f"found {self.z.shape} and {self.sigma.shape}"
             )
         check_rows(self.name, self.t_ns, {"value": self.z}, strict=True)
-        bad = np.flatnonzero(~(self.sigma > 0).all(axis=1))
+        bad = np.flatnonzero(~is_noise(self.sigma))
         if len(bad):
             raise DatasetError(f"{self.name}: row {bad[0]}: sigma must be positive, found {self.sigma[bad[0]]}")
         early = np.flatnonzero(self.received_ns < self.t_ns)
@@ -155,10 +161,7 @@ class AttitudeStream(ReadingStream):
         R = self.z.reshape(-1, 3, 3)
         bad = np.flatnonzero(off_rotation(R) > UNHEARD)
         if len(bad):
-            raise DatasetError(
-                f"attitude: row {bad[0]} ({len(bad)} in all) is {complaint(R[bad[0]], UNHEARD)}; "
-                "--repair drops such rows"
-            )
+            raise DatasetError(f"attitude: row {bad[0]} ({len(bad)} in all) is {complaint(R[bad[0]], UNHEARD)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +179,7 @@ class Log:
         notes: what was repaired, converted, counted or fitted on reading, one sentence each; a `notes.Note` where a
             reader of the numbers should know it.
         origin: (latitude °, longitude °) of W's origin, if the log is geodetic.
+        max_wait_s: how long the start may wait for its sensors, s; None: as long as `initialise` does by default.
     """
 
     name: str
@@ -190,6 +194,7 @@ class Log:
     prior: Belief | None = None
     notes: tuple[str, ...] = ()
     origin: tuple[float, float] | None = None
+    max_wait_s: float | None = None
 
     @property
     def streams(self) -> dict[str, ReadingStream]:

@@ -1,4 +1,4 @@
-"""Times from files, without loss: text, integers or floats in a unit, to int64 nanoseconds."""
+"""Times from files, without loss: text, integers or floats in a unit, and dates, to int64 nanoseconds."""
 
 from __future__ import annotations
 
@@ -12,16 +12,40 @@ from .state import LIMIT_NS, TimeArray
 
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Nanoseconds per unit."""
+DAY_NS = 86_400 * 1_000_000_000
+"""Nanoseconds per day."""
+FAR_NS = 400 * DAY_NS
+"""No log is as long as 400 days."""
 NO_TIME = Decimal("nan")
+DATE_UNITS = ("W", "D", "h", "m", "s", "ms", "us", "ns")
+"""Units of datetime64 that are whole nanoseconds; months and years are of no fixed length."""
+LONGEST_DATE = 64
+"""Characters of a date: 2023-11-14T22:13:20.123456789+00:00 has 35."""
+
+
+def far(t_ns: TimeArray) -> NDArray[np.bool_]:
+    """Return the rows (n,) whose time is more than 400 days from the median: of a clock that was not set."""
+    return np.abs(t_ns - int(np.median(t_ns))) > FAR_NS if len(t_ns) else np.zeros(0, bool)
+
+
+def far_complaint(t_ns: TimeArray, row: int) -> str:
+    """Return how far from the median a row's time is."""
+    days = abs(int(t_ns[row]) - int(np.median(t_ns))) / DAY_NS
+    return f"time {t_ns[row]} ns is {days:.0f} days from the middle of the stream"
 
 
 def times_ns(values: NDArray[Any], unit: str) -> tuple[TimeArray, NDArray[np.bool_]]:
     """Convert times as read to nanoseconds; text and integers exactly, floats to the nearest nanosecond.
 
+    A date, as text (ISO 8601) or as datetime64, becomes nanoseconds since 1970, UTC where it names no zone; a duration
+    or a time of day becomes its nanoseconds. The unit is that of plain numbers.
+
     Returns:
         (n,) int64, and a mask of the rows with a valid time; the others are 0.
     """
     factor = NS_PER[unit]
+    if values.dtype.kind in "mM":
+        return _dates_ns(values)
     if values.dtype.kind in "iu":
         good = (np.abs(values.astype(float)) * factor) < LIMIT_NS
         return np.where(good, values, 0).astype(np.int64) * factor, good
@@ -34,13 +58,39 @@ def times_ns(values: NDArray[Any], unit: str) -> tuple[TimeArray, NDArray[np.boo
         rest = np.rint((safe - whole) * factor).astype(np.int64)
         return whole.astype(np.int64) * factor + rest, good
     ns, good = np.zeros(len(values), np.int64), np.zeros(len(values), bool)
+    words: list[int] = []
     for row, text in enumerate(values):
         try:
             value = Decimal(text.strip()) * factor if isinstance(text, str) else NO_TIME
         except ArithmeticError:
-            value = NO_TIME
+            words.append(row)
+            continue
         if value.is_finite() and abs(value) < LIMIT_NS:
             ns[row], good[row] = round(value), True
+    if words:
+        ns[words], good[words] = _written_dates_ns([values[row].strip() for row in words])
+    return ns, good
+
+
+def _dates_ns(values: NDArray[Any]) -> tuple[TimeArray, NDArray[np.bool_]]:
+    """Convert datetime64 or timedelta64 of any unit, as `times_ns` does."""
+    unit, count = np.datetime_data(values.dtype)
+    step_ns = int(np.timedelta64(count, unit) / np.timedelta64(1, "ns")) if unit in DATE_UNITS else 0
+    ticks = values.astype(np.int64)
+    good = ~np.isnat(values) & (np.abs(ticks.astype(float)) * step_ns < LIMIT_NS) & (step_ns > 0)
+    return np.where(good, ticks, 0) * step_ns, good
+
+
+def _written_dates_ns(texts: list[str]) -> tuple[TimeArray, NDArray[np.bool_]]:
+    """Convert dates by ISO 8601, durations as pandas writes them, and times of day, as `times_ns` does."""
+    import pandas as pd
+
+    short = [text.replace(",", ".") if len(text) <= LONGEST_DATE else "" for text in texts]
+    dates = pd.to_datetime(pd.Series(short, dtype=object), format="ISO8601", errors="coerce", utc=True)
+    ns, good = _dates_ns(dates.dt.tz_localize(None).to_numpy())
+    if not good.all():
+        spans = pd.to_timedelta(pd.Series(short, dtype=object)[~good], errors="coerce")
+        ns[~good], good[~good] = _dates_ns(spans.to_numpy())
     return ns, good
 
 

@@ -16,13 +16,21 @@ from .errors import DatasetError
 from .files import regular_file
 from .rotations import TOLERANCE, complaint, is_rotation, note, off_rotation, off_unit, orthonormalised
 from .state import DIM, Array, Belief, NavState, TimeArray
-from .times import seconds_to_ns
+from .times import far, far_complaint, seconds_to_ns, times_ns
 
 if TYPE_CHECKING:
     import pandas as pd
 
 COVARIANCE = {(i, j): f"P_{i}_{j}" for i in range(DIM) for j in range(i, DIM)}
 """Columns of a table for the upper triangle of P, by row and column of it."""
+
+COLUMNS = (
+    "t_ns",
+    *(f"R_WB_{i}{j}" for i in range(3) for j in range(3)),
+    *(f"{name}_{axis}" for name in ("p_WB_W", "v_WB_W", "b_a", "b_g") for axis in "xyz"),
+    *COVARIANCE.values(),
+)
+"""Every column that a table of a trajectory may have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +73,17 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def with_times_checked(self) -> Trajectory:
+        """Return it.
+
+        Raises:
+            DatasetError: a time is more than 400 days from the median, as of a clock that was not set.
+        """
+        bad = np.flatnonzero(far(self.t_ns))
+        if len(bad):
+            raise DatasetError(f"trajectory: row {bad[0]} ({len(bad)} in all): {far_complaint(self.t_ns, int(bad[0]))}")
+        return self
 
     def select(self, rows: NDArray[np.bool_] | TimeArray | slice) -> Trajectory:
         """Return the rows given by a mask, indices or a slice."""
@@ -167,7 +186,8 @@ class Trajectory:
         R_WB = Rotation.from_quat(values[:, 3:]).as_matrix()
         try:
             notes = note("trajectory", off_unit(values[:, 3:]))
-            return cls(np.array(t_ns, dtype=np.int64), R_WB, values[:, :3], lookahead_s=lookahead_s, notes=notes)
+            times = np.array(t_ns, dtype=np.int64)
+            return cls(times, R_WB, values[:, :3], lookahead_s=lookahead_s, notes=notes).with_times_checked()
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from None
 
@@ -198,8 +218,6 @@ class Trajectory:
         Raises:
             DatasetError: a column is missing, or a time is invalid.
         """
-        from .times import times_ns
-
         rotation, position = [f"R_WB_{i}{j}" for i in range(3) for j in range(3)], [f"p_WB_W_{a}" for a in "xyz"]
         absent = [name for name in ("t_ns", *rotation, *position) if name not in table]
         if absent:

@@ -18,4 +18,6 @@ Data = Annotated[
 ]
 Results = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for results.")]
 Jobs = Annotated[int, typer.Option(min=0, metavar="N", help="Number of worker processes; 0: one per core.")]
-Repair = Annotated[bool, typer.Option("--repair", help="Drop bad rows of a log and report how many.")]
+Repair = Annotated[
+    bool, typer.Option("--repair", help="Drop bad rows of a log, at most half of a stream, and report how many.")
+]

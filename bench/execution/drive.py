@@ -285,7 +285,9 @@ def score_ticks(log: Log, period_s: float) -> TimeArray:
         return np.arange(log.start_ns + period_ns, int(log.imu.t_ns[-1]) + 1, period_ns, dtype=np.int64)
     stamps, first_ns = log.truth.t_ns, log.start_ns + period_ns
     begin_ns = stamps[np.abs(stamps - first_ns).argmin()]
-    grid = np.arange(begin_ns, stamps[-1] + 1, period_ns)
+    beside = (stamps - begin_ns) // period_ns  # points of the grid near a stamp: in a hole of years there are none
+    points = np.unique(np.concatenate([beside, beside + 1]))
+    grid = begin_ns + points[(points >= 0) & (points <= (stamps[-1] - begin_ns) // period_ns)] * period_ns
     after = np.searchsorted(stamps, grid)
     before = (after - 1).clip(0)
     return np.unique(stamps[np.where(grid - stamps[before] <= stamps[after] - grid, before, after)])

@@ -1,29 +1,26 @@
 """From a description and a folder to a Log: rows are read, checked, and converted to our frames and units.
 
-The steps are the same for every stream. Rows declared invalid are dropped. Rows with numbers that are not finite are an
-error, or dropped with `repair`. Declared outliers are dropped. Times out of order are an error, or dropped with
-`repair`. Every n-th row is kept. `Log.notes` counts all that was dropped. A truth or a stream that does not overlap
-the IMU's time is an error: some clock is wrong.
+The steps are the same for every stream. Rows declared invalid or outside the window are dropped. Rows with numbers
+that are not finite are an error, or dropped with `repair`. Declared outliers are dropped. Times out of order are an
+error, or dropped with `repair`. Every n-th row is kept. `Log.notes` counts all that was dropped. A truth or a stream
+that does not overlap the IMU's time is an error: some clock is wrong.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
 from ..files import inside
-from ..formats.columns import EXACT, Columns, read_table
-from ..formats.recording import Recording, Wanted
-from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
+from ..formats.parquet import read_known
+from ..formats.text_table import EXACT
+from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..notes import Note
 from ..rig import Rig
 from ..rotations import (
@@ -35,160 +32,13 @@ from ..rotations import (
     off_unit,
     orthonormalised,
 )
-from ..state import Array, TimeArray
-from ..times import NS_PER, times_ns
-from ..trajectory import Trajectory
+from ..state import Array
+from ..trajectory import COLUMNS, Trajectory
 from . import description as d
-from .device_clock import common_instants
-from .geodesy import SEMI_MAJOR_M, ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
-
-Mask = NDArray[Any]
-FLIP_YZ = np.array([1.0, -1.0, -1.0])
-"""FRD to FLU, and back."""
-FAR_M = 100e3
-"""From a spherical Earth of the semi-major axis: the ellipsoid is within 21 km of it, and a receiver without a fix
-reports (0, 0, 0)."""
-DEVICE = "device"
-"""The column added by a message's own clock."""
-
-
-@dataclass
-class _Opening:
-    """The state of opening one folder: description, strictness, notes and messages so far."""
-
-    description: d.Description
-    folder: Path
-    repair: bool
-    notes: list[str] = field(default_factory=list)
-    messages: dict[tuple[str, int | None], Mapping[str, NDArray[Any]]] | None = None
-
-    def columns(self, part: d.SourceDescription | d.TruthDescription, wanted: Iterable[d.Column]) -> Columns:
-        """Read the raw columns of a part from its table or its messages; times are not converted."""
-        times = [] if part.time is None else [c for c in (part.time.column, part.time.received) if c is not None]
-        if part.table is not None:
-            return read_table(self.folder, part.table, [c for c in wanted if c not in times], times)
-        assert part.message is not None
-        return self._joined(part.message, list(wanted))
-
-    def _joined(self, message: d.Message, wanted: list[d.Column]) -> Columns:
-        """Return columns of messages; `device` is their own clock, mapped to the host's."""
-        if self.messages is None:
-            self._read_messages()
-        assert self.messages is not None
-        recording = self.description.recording
-        assert recording is not None
-        found = [self.messages[name, message.entity] for name in message.names]
-        picks: list[Any] = [slice(None)] * len(found)
-        device: Array | None = None
-        if message.clock is not None:
-            column, unit = recording.host_clock
-            host_s = [part[column] * (NS_PER[unit] * 1e-9) for part in found]
-            device_s = [part[message.clock.field].astype(float) for part in found]
-            picks, device = common_instants(host_s, device_s, message.clock.wraps_at_s)
-            if not len(device):
-                where = recording.path(self.folder)
-                raise DatasetError(f"{where}: {' and '.join(message.names)} have no device time in common")
-        columns: Columns = {}
-        for column in wanted:
-            if column == DEVICE and device is not None:
-                columns[column] = device
-            else:
-                which, field_name = _field(message, str(column), recording, self.folder)
-                columns[column] = found[which][field_name][picks[which]]
-        return columns
-
-    def _read_messages(self) -> None:
-        """Read everything that the description needs from its recording, in one pass."""
-        recording = self.description.recording
-        assert recording is not None
-        asked: dict[tuple[str, int | None], dict[str, None]] = {}
-        for part, wanted in _sources(self.description):
-            if part.message is None:
-                continue
-            for name in part.message.names:
-                columns = asked.setdefault((name, part.message.entity), {})
-                if part.message.clock is not None:
-                    columns |= dict.fromkeys((recording.host_clock[0], part.message.clock.field))
-            for column in wanted:
-                if column != DEVICE or part.message.clock is None:
-                    which, field_name = _field(part.message, str(column), recording, self.folder)
-                    asked[part.message.names[which], part.message.entity][field_name] = None
-        read = recording.read(self.folder, [Wanted(*key, tuple(columns)) for key, columns in asked.items()])
-        self.messages = dict(zip(asked, read.columns, strict=True))
-        self.notes += [note if isinstance(note, Note) else Note(note, "damage") for note in read.notes]
-
-
-def _field(message: d.Message, column: str, recording: Recording, folder: Path) -> tuple[int, str]:
-    """Return the index of the joined message that has a column, and its field; the host's stamp is the first one's."""
-    if len(message.names) == 1 or column == recording.host_clock[0]:
-        return 0, column
-    for which, name in enumerate(message.names):
-        if column.startswith(f"{name}."):
-            return which, column.removeprefix(f"{name}.")
-    raise DatasetError(f"{folder}: column {column!r}: expected `Name.field` of one of {', '.join(message.names)}")
-
-
-def _sources(description: d.Description) -> Iterator[tuple[Any, list[d.Column]]]:
-    """Yield every source of columns of a description, with the columns to read from it."""
-    for part in description.parts.values():
-        if isinstance(part, d.ImuDescription) and part.accel_source is not None:
-            yield part.accel_source, [*d.columns_of(part.accel_source), *part.accel.columns]
-            yield part, d.columns_of(part.model_copy(update={"accel": None}))
-        else:
-            yield part, d.columns_of(part)
-
-
-@dataclass
-class _Rows:
-    """The remaining rows of one stream, with their number in the source.
-
-    Attributes:
-        raw: (n,) per column, not converted.
-        number: (n,) row in the source, from 0.
-        t_ns, received_ns: (n,).
-        total: how many rows the source has.
-    """
-
-    stream: str
-    opening: _Opening
-    raw: Columns
-    number: TimeArray
-    t_ns: TimeArray
-    received_ns: TimeArray
-    total: int
-
-    def keep(self, mask: Mask) -> None:
-        self.raw = {column: values[mask] for column, values in self.raw.items()}
-        self.number, self.t_ns, self.received_ns = self.number[mask], self.t_ns[mask], self.received_ns[mask]
-
-    def note(self, count: int, what: str) -> None:
-        if count:
-            text = f"{self.stream}: {count} rows {what} dropped"
-            self.opening.notes.append(Note(text, "dropped", self.stream, count, self.total))
-
-    def refuse(self, bad: Mask, complaint: Any, what: str) -> None:
-        """With repair, drop the rows of `bad`; without, raise complaint(first bad row)."""
-        if not bad.any():
-            return
-        first, count = int(np.flatnonzero(bad)[0]), int(np.count_nonzero(bad))
-        if not self.opening.repair:
-            raise DatasetError(
-                f"{self.opening.folder}: {self.stream}: row {self.number[first]} ({count} in all): {complaint(first)}; "
-                "--repair drops such rows"
-            )
-        self.note(count, f"{what} (repair)")
-        self.keep(~bad)
-
-    def si(self, quantity: d.Quantity) -> Array:
-        """Return (n, k): the quantity's columns in SI, in the axes of the source."""
-        values = np.stack([self.raw[c] for c in quantity.columns], axis=1).astype(float, copy=False)
-        factor = quantity.units[quantity.unit]
-        with np.errstate(over="ignore", invalid="ignore"):
-            if np.any(np.not_equal(quantity.scale, 1.0)):
-                values = values * np.asarray(quantity.scale)
-            if np.any(np.not_equal(quantity.offset, 0.0)):
-                values = values + np.asarray(quantity.offset)
-            return values if factor == 1.0 else values * factor
+from .inertial import FLIP_YZ, flu, read_imu
+from .positions import enu, enu_from_ecef, first_fix, position, position_rows
+from .rows import Rows, check_width, drop_outliers, read_rows, sigma
+from .sources import Opening, wrong_clock
 
 
 @contextmanager
@@ -206,16 +56,16 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     Raises:
         DatasetError: names the problem with file or stream, row and value.
     """
-    opening = _Opening(description, folder, repair)
+    opening = Opening(description, folder, repair)
     streams = description.streams
-    imu = _imu(opening, streams.imu)
+    imu = read_imu(opening, streams.imu)
     dvl = None if streams.dvl is None else _dvl(opening, streams.dvl)
     depth = None if streams.depth is None else _depth(opening, streams.depth)
-    gps_rows = None if streams.gps is None else _stream(opening, "gps", streams.gps, _position_columns(streams.gps))
-    truth_part = description.truth
-    truth_rows = None
-    if truth_part is not None and truth_part.time is not None and (truth_part.table or truth_part.message):
-        truth_rows = _stream(opening, "truth", truth_part, _truth_columns(truth_part))
+    gps_rows = None if streams.gps is None else position_rows(opening, "gps", streams.gps)
+    truth_part, truth_rows = description.truth, None
+    if truth_part is not None and (truth_part.table or truth_part.message):
+        others = [part.columns for part in (truth_part.velocity, truth_part.attitude) if part is not None]
+        truth_rows = position_rows(opening, "truth", truth_part, tuple(chain(*others)))
 
     origin = None
     if description.origin is not None:
@@ -223,17 +73,17 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     else:
         for part, rows in ((streams.gps, gps_rows), (truth_part, truth_rows)):
             if origin is None and part is not None and part.on_the_globe and rows is not None:
-                origin = _first_fix(part, rows, int(imu.t_ns[0]))
+                origin = first_fix(part, rows, int(imu.t_ns[0]))
     gps = None if gps_rows is None or streams.gps is None else _gps(streams.gps, gps_rows, origin)
     heading = None if streams.heading is None else _heading(opening, streams.heading, origin)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
-        opening.notes += (f"truth: {mended}" for mended in truth.notes)
+        opening.notes += (Note(f"truth: {mended}", "repaired", "truth") for mended in truth.notes)
     for name, part in description.parts.items():
         mounting = getattr(part, "mounting", None)
-        opening.notes += () if mounting is None else mounting.notes(name)
-    opening.notes += () if description.prior is None else description.prior.notes
+        opening.notes += (Note(text, "repaired", name) for text in (() if mounting is None else mounting.notes(name)))
+    opening.notes += (Note(text, "repaired") for text in (() if description.prior is None else description.prior.notes))
 
     with _named(folder):
         mountings = {
@@ -264,6 +114,7 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
         prior=None if description.prior is None else description.prior.belief(),
         notes=(*description.notes, *opening.notes),
         origin=degrees,
+        max_wait_s=description.max_wait_s,
     )
     with _named(folder):
         _check_clocks(log)
@@ -281,206 +132,24 @@ def _check_clocks(log: Log) -> None:
     for name, part in {**log.streams, "truth": log.truth}.items():
         if part is not None and len(part) and (part.t_ns[-1] < start_ns or part.t_ns[0] > end_ns):
             raise DatasetError(
-                f"{name}: {part.t_ns[0] * 1e-9:.3f} s to {part.t_ns[-1] * 1e-9:.3f} s lies wholly outside {imu}; "
-                "check its clock (`clock_offset_s`) and the `unit` of its time"
+                wrong_clock(name, (int(part.t_ns[0]), int(part.t_ns[-1])), (int(log.imu.t_ns[0]), end_ns))
             )
 
 
-def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) -> _Rows:
-    """Read a stream's rows, and drop or refuse those without a valid time or finite numbers."""
-    time: d.Time = part.time
-    sigma = getattr(part, "sigma", None)
-    sigma_columns = [] if sigma is None else list(sigma.columns)
-    valid: d.Valid | None = part.valid
-    times = [c for c in (time.column, time.received) if c is not None]
-    plain = [*columns, *sigma_columns, *([] if valid is None else [valid.column])]
-    twice = [c for c in times if c in plain]
-    if twice:
-        raise DatasetError(f"{opening.folder}: {stream}: column {twice[0]!r} cannot be a time and something else")
-    raw = opening.columns(part, [*plain, *times])
-    count = len(next(iter(raw.values())))
-    offset_ns = round(time.clock_offset_s * 1e9)
-
-    if time.column is None:
-        assert time.row_rate_hz is not None
-        seconds = time.start_s + np.arange(count) / time.row_rate_hz
-        stamp_ns, timed = times_ns(seconds, "s")
-    else:
-        stamp_ns, timed = times_ns(raw[time.column], time.unit)
-    t_ns = stamp_ns + offset_ns - round(time.delay_s * 1e9)
-    received_ns = stamp_ns + offset_ns
-    if time.received is not None:
-        received_ns, also = times_ns(raw[time.received], time.unit)
-        received_ns, timed = received_ns + offset_ns, timed & also
-
-    rows = _Rows(stream, opening, raw, np.arange(count), t_ns, received_ns, count)
-    if valid is not None:
-        good = np.isin(raw[valid.column], valid.values)
-        rows.note(int(np.count_nonzero(~good)), "invalid")
-        rows.keep(good)
-        timed = timed[good]
-
-    def untimed(row: int) -> str:
-        values = {c: rows.raw[c][row] for c in times}
-        return f"time is {', '.join(map(str, values.values())) or 'beyond the clock'}"
-
-    rows.refuse(np.asarray(~timed), untimed, "without a time")
-    if columns:
-        finite = np.isfinite(np.stack([rows.raw[c].astype(float) for c in columns], axis=1))
-
-        def infinite(row: int) -> str:
-            column = columns[int(np.flatnonzero(~finite[row])[0])]
-            return f"column {column!r} is {rows.raw[column][row]}"
-
-        rows.refuse(np.asarray(~finite.all(axis=1)), infinite, "not finite")
-    if sigma_columns:
-        values = np.stack([rows.raw[c] for c in sigma_columns], axis=1)
-        bad_sigma = np.asarray(~(values > 0).all(axis=1))
-        rows.refuse(
-            bad_sigma,
-            lambda row: f"sigma must be positive, found {values[row]}",
-            "without a positive sigma",
-        )
-    early = np.asarray(rows.received_ns < rows.t_ns)
-    rows.refuse(early, lambda row: "received before it was true", "received before they were true")
-    return rows
-
-
-def _stray(t_ns: TimeArray) -> Mask:
-    """Return the fewest rows without which times increase; of two such choices, the one that keeps the earlier rows."""
-    late = np.zeros(len(t_ns), bool)
-    late[1:] = t_ns[1:] <= np.maximum.accumulate(t_ns)[:-1]
-    if not late.any():
-        return late
-    last: list[int] = []  # of the increasing runs of length 1, 2, …: the least last time
-    rank = []  # of each row: the longest run that ends there, less one
-    for t in t_ns.tolist():
-        rank.append(bisect_left(last, t))
-        last[rank[-1] : rank[-1] + 1] = [t]
-    if len(last) == np.count_nonzero(~late):
-        return late
-    stray = np.ones(len(t_ns), bool)
-    wanted, below = len(last) - 1, last[-1] + 1
-    for row in range(len(t_ns) - 1, -1, -1):
-        if rank[row] == wanted and t_ns[row] < below:
-            stray[row] = False
-            wanted, below = wanted - 1, t_ns[row]
-    return stray
-
-
-def _in_order(rows: _Rows, every: int) -> NDArray[np.int64]:
-    """Refuse times out of order; return which of the rows (as they were) are left, every n-th of them."""
-    t_ns = rows.t_ns
-    stray = _stray(t_ns)
-
-    def out_of_order(row: int) -> str:
-        if row == 0 or t_ns[row] > t_ns[row - 1]:
-            return f"time {t_ns[row]} ns is ahead of rows below"
-        how = "repeats" if t_ns[row] == t_ns[row - 1] else "comes before"
-        return f"time {t_ns[row]} ns {how} the row above"
-
-    lost = np.count_nonzero(stray & ~np.isin(t_ns, t_ns[~stray]))  # a row that repeats a time is no loss
-    if rows.opening.repair and 2 * lost > len(t_ns):
-        raise DatasetError(
-            f"{rows.opening.folder}: {rows.stream}: {lost} of {len(t_ns)} rows are out of order, too many to drop; "
-            "check the column of its time"
-        )
-    rows.refuse(stray, out_of_order, "out of order")
-    left = np.flatnonzero(~stray)[::every]
-    if every > 1:
-        mask = np.zeros(len(rows.t_ns), bool)
-        mask[::every] = True
-        rows.opening.notes.append(f"{rows.stream}: every {every}th row kept, {int(mask.sum())} of {len(mask)}")
-        rows.keep(mask)
-    return left
-
-
-def _without_outliers(rows: _Rows, outliers: d.Outliers | None, values: Array, unit: str) -> Array:
-    """Drop rows whose norm exceeds the bound; return the remaining values."""
-    if outliers is None:
-        return values
-    chosen = list(range(values.shape[1])) if outliers.components is None else list(outliers.components)
-    if max(chosen, default=0) >= values.shape[1]:
-        raise DatasetError(f"{rows.opening.folder}: {rows.stream}: outliers: it has {values.shape[1]} components only")
-    far = np.linalg.norm(values[:, chosen], axis=1) > outliers.above
-    rows.note(int(np.count_nonzero(far)), f"over {outliers.above:g} {unit}")
-    rows.keep(~far)
-    return values[~far]
-
-
-def _sigma(rows: _Rows, part: Any, width: int) -> Array:
-    """Return (n, width), SI."""
-    if part.sigma is not None:
-        sigma = rows.si(part.sigma)
-        return sigma if sigma.shape[1] == width else np.repeat(sigma, width, axis=1)
-    fixed = np.asarray(getattr(part, part.sigma_field), float)
-    if part.sigma_field == "sigma_deg":
-        fixed = np.radians(fixed)
-    return np.tile(np.broadcast_to(fixed, (width,)), (len(rows.t_ns), 1))
-
-
-def _checked_width(rows: _Rows, part: Any, width: int) -> None:
-    if part.sigma is not None and len(part.sigma.columns) not in (1, width):
-        raise DatasetError(f"{rows.opening.folder}: {rows.stream}: sigma: expected {width} columns")
-
-
-def _flu(values: Array, axes: str) -> Array:
-    return values * FLIP_YZ if axes == "FRD" else values
-
-
-def _enu(values: Array, frame: str) -> Array:
-    return np.stack([values[:, 1], values[:, 0], -values[:, 2]], axis=1) if frame == "NED" else values
-
-
-def _imu(opening: _Opening, part: d.ImuDescription) -> ImuStream:
-    if part.accel_source is not None:
-        t_ns, gyro, accel = _gyro_and_accel(opening, part, part.accel_source)
-    else:
-        rows = _stream(opening, "imu", part, [*part.gyro.columns, *part.accel.columns])
-        _in_order(rows, part.every)
-        t_ns, gyro, accel = rows.t_ns, rows.si(part.gyro), rows.si(part.accel)
-    with _named(opening.folder):
-        return ImuStream(t_ns, _flu(gyro, part.axes), _flu(accel, part.axes))
-
-
-def _gyro_and_accel(
-    opening: _Opening, part: d.ImuDescription, source: d.SourceDescription
-) -> tuple[TimeArray, Array, Array]:
-    """Return the gyro's times and samples, and the accelerometer's interpolated linearly to them.
-
-    A gyro sample without accelerometer samples on both sides, within two of their periods, is dropped and counted.
-    """
-    rows = _stream(opening, "imu", part, list(part.gyro.columns))
-    _in_order(rows, 1)
-    other = _stream(opening, "imu", source, list(part.accel.columns))
-    _in_order(other, 1)
-    accel, gyro = other.si(part.accel), rows.si(part.gyro)
-    if len(other.t_ns) < 2:
-        raise DatasetError(f"{opening.folder}: imu: {len(other.t_ns)} accelerometer rows, at least 2 are needed")
-    after = np.searchsorted(other.t_ns, rows.t_ns).clip(1, len(other.t_ns) - 1)
-    step = other.t_ns[after] - other.t_ns[after - 1]
-    weight = (rows.t_ns - other.t_ns[after - 1]) / step
-    alone = (weight < 0) | (weight > 1) | ((step > 2 * np.median(np.diff(other.t_ns))) & (weight % 1 != 0))
-    rows.note(int(np.count_nonzero(alone)), "of the gyro without the accelerometer's beside them")
-    at, share = after[~alone], weight[~alone, None]
-    accel = accel[at - 1] * (1 - share) + accel[at] * share
-    kept = slice(None, None, part.every)
-    return rows.t_ns[~alone][kept], gyro[~alone][kept], accel[kept]
-
-
-def _dvl(opening: _Opening, part: d.DvlDescription) -> DvlStream:
-    rows = _stream(opening, "dvl", part, list(part.velocity.columns))
+def _dvl(opening: Opening, part: d.DvlDescription) -> DvlStream:
+    rows = read_rows(opening, "dvl", part, list(part.velocity.columns))
     measured = ["xyz".index(axis) for axis in part.measures]
-    _checked_width(rows, part, len(measured))
-    values = _without_outliers(rows, part.outliers, rows.si(part.velocity), "m/s")
-    values = values[_in_order(rows, part.every)]
-    v_S, sigma = np.zeros((len(values), 3)), np.full((len(values), 3), np.inf)
-    v_S[:, measured], sigma[:, measured] = values, _sigma(rows, part, len(measured))
-    v_S = _flu(v_S, part.axes)
+    check_width(rows, part, len(measured))
+    rows.values["z"] = rows.si(part.velocity)
+    drop_outliers(rows, part.outliers, "z", "m/s")
+    rows.put_in_order(part.every)
+    v_S, spread = np.zeros((len(rows.t_ns), 3)), np.full((len(rows.t_ns), 3), np.inf)
+    v_S[:, measured], spread[:, measured] = rows.values["z"], sigma(rows, part, len(measured))
+    v_S = flu(v_S, part.axes)
     if part.mounting != d.MountingSpec():
         R_BS = part.mounting.mounting().R_BS
-        v_S, sigma = v_S @ R_BS.T, _turned(sigma, R_BS)
-    return DvlStream(rows.t_ns, rows.received_ns, v_S, sigma)
+        v_S, spread = v_S @ R_BS.T, _turned(spread, R_BS)
+    return DvlStream(rows.t_ns, rows.received_ns, v_S, spread)
 
 
 def _turned(sigma: Array, R_BS: Array) -> Array:
@@ -493,46 +162,41 @@ def _turned(sigma: Array, R_BS: Array) -> Array:
     return np.sqrt(np.where(np.abs(R_BS) < 1e-12, 0.0, shares).sum(axis=2))
 
 
-def _depth(opening: _Opening, part: d.DepthDescription) -> DepthStream:
-    rows = _stream(opening, "depth", part, list(part.depth.columns))
-    values = _without_outliers(rows, part.outliers, rows.si(part.depth), "m")
-    values = values[_in_order(rows, part.every)]
-    z_m = -values if part.positive == "down" else values
-    return DepthStream(rows.t_ns, rows.received_ns, z_m, _sigma(rows, part, 1))
+def _depth(opening: Opening, part: d.DepthDescription) -> DepthStream:
+    rows = read_rows(opening, "depth", part, list(part.depth.columns))
+    rows.values["z"] = rows.si(part.depth)
+    drop_outliers(rows, part.outliers, "z", "m")
+    rows.put_in_order(part.every)
+    z_m = -rows.values["z"] if part.positive == "down" else rows.values["z"]
+    return DepthStream(rows.t_ns, rows.received_ns, z_m, sigma(rows, part, 1))
 
 
 def _heading(
-    opening: _Opening, part: d.HeadingDescription, origin: tuple[float, float] | None
+    opening: Opening, part: d.HeadingDescription, origin: tuple[float, float] | None
 ) -> HeadingStream | AttitudeStream:
     if part.attitude is not None:
-        rows = _stream(opening, "heading", part, list(part.attitude.columns))
-        _checked_width(rows, part, 3)
-        R = _rotations(rows, part.attitude, origin)
-        R = R[_in_order(rows, part.every)]
-        return AttitudeStream(rows.t_ns, rows.received_ns, R.reshape(-1, 9), _sigma(rows, part, 3))
+        rows = read_rows(opening, "heading", part, list(part.attitude.columns))
+        check_width(rows, part, 3)
+        _put_rotations(rows, part.attitude, origin)
+        rows.put_in_order(part.every)
+        return AttitudeStream(rows.t_ns, rows.received_ns, rows.values["R"].reshape(-1, 9), sigma(rows, part, 3))
     assert part.heading is not None
-    rows = _stream(opening, "heading", part, list(part.heading.columns))
-    _checked_width(rows, part, 1)
+    rows = read_rows(opening, "heading", part, list(part.heading.columns))
+    check_width(rows, part, 1)
     psi = rows.si(part.heading)
     if part.add_deg:
         psi = psi + np.radians(part.add_deg)
     if part.convention == "compass":
         psi = np.pi / 2 - psi
         psi = np.arctan2(np.sin(psi), np.cos(psi))
-    psi = _without_outliers(rows, part.outliers, psi, "rad")
-    psi = psi[_in_order(rows, part.every)]
-    return HeadingStream(rows.t_ns, rows.received_ns, psi, _sigma(rows, part, 1))
+    rows.values["z"] = psi
+    drop_outliers(rows, part.outliers, "z", "rad")
+    rows.put_in_order(part.every)
+    return HeadingStream(rows.t_ns, rows.received_ns, rows.values["z"], sigma(rows, part, 1))
 
 
-def _enu_from_ecef(rows: _Rows, origin: tuple[float, float] | None) -> Array:
-    """Return (3, 3): rows are east, north and up at W's origin, in ECEF axes."""
-    if origin is None:
-        raise DatasetError(f"{rows.opening.folder}: {rows.stream}: ECEF axes need W's origin; give `origin`")
-    return enu_axes(np.array(origin[0]), np.array(origin[1]))
-
-
-def _rotations(rows: _Rows, part: d.Attitude, origin: tuple[float, float] | None) -> Array:
-    """Return (n, 3, 3), body FLU to W; refuse what is not a rotation."""
+def _put_rotations(rows: Rows, part: d.Attitude, origin: tuple[float, float] | None) -> None:
+    """Put the value "R" (n, 3, 3), body FLU to W; refuse what is not a rotation."""
     values = np.stack([rows.raw[c] for c in part.columns], axis=1).astype(float, copy=False)
     if part.form == "roll_pitch_yaw":
         angles = np.radians(values) if part.unit == "deg" else values
@@ -541,150 +205,67 @@ def _rotations(rows: _Rows, part: d.Attitude, origin: tuple[float, float] | None
         R = values.reshape(-1, 3, 3)
         off = off_rotation(R)
         good = is_rotation(off)
-        rows.refuse(~good, lambda row: complaint(R[row]), "that are not rotations")
-        rows.opening.notes += note(rows.stream, off[good])
+        rows.refuse(~good, lambda row: complaint(R[row]), "without a rotation")
+        rows.opening.notes += (Note(text, "repaired", rows.stream) for text in note(rows.stream, off[good]))
         R = orthonormalised(R[good], off[good])
     else:
         off = off_unit(values)
         good = is_rotation(off)
-        rows.refuse(~good, lambda row: complaint_of_quaternion(values[row]), "that are not unit quaternions")
-        rows.opening.notes += note(rows.stream, off[good])
+        rows.refuse(~good, lambda row: complaint_of_quaternion(values[row]), "without a unit quaternion")
+        rows.opening.notes += (Note(text, "repaired", rows.stream) for text in note(rows.stream, off[good]))
         q_xyzw = values[good] if part.form == "quaternion_xyzw" else np.roll(values[good], -1, axis=1)
         R = Rotation.from_quat(q_xyzw).as_matrix().reshape(-1, 3, 3)
     if part.world == "NED":
         R = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]) @ R
     elif part.world == "ECEF":
-        R = _enu_from_ecef(rows, origin) @ R
-    return R * FLIP_YZ if part.axes == "FRD" else R
+        R = enu_from_ecef(rows, origin) @ R
+    rows.values["R"] = R * FLIP_YZ if part.axes == "FRD" else R
 
 
-def _position_columns(part: Any) -> list[d.Column]:
-    columns: list[d.Column] = [] if part.position is None else list(part.position.columns)
-    if part.geodetic is not None:
-        columns += [part.geodetic.latitude, part.geodetic.longitude]
-        columns += [] if part.geodetic.altitude is None else list(part.geodetic.altitude.columns)
-    return columns
-
-
-def _truth_columns(part: d.TruthDescription) -> list[d.Column]:
-    columns = _position_columns(part)
-    columns += [] if part.velocity is None else list(part.velocity.columns)
-    return columns + ([] if part.attitude is None else list(part.attitude.columns))
-
-
-def degrees_from_ddmm(ddmm: Array) -> Array:
-    """Return degrees from degrees · 100 + minutes, sign kept."""
-    degrees = np.trunc(ddmm / 100)
-    return degrees + (ddmm - 100 * degrees) / 60
-
-
-def _latitude_longitude(rows: _Rows, part: d.Geodetic) -> tuple[Array, Array]:
-    """Return radians; refuse impossible latitudes and longitudes."""
-
-    def convert() -> tuple[Array, Array]:
-        lat, lon = rows.raw[part.latitude].astype(float), rows.raw[part.longitude].astype(float)
-        if part.unit == "ddmm":
-            lat, lon = degrees_from_ddmm(lat), degrees_from_ddmm(lon)
-        return (lat, lon) if part.unit == "rad" else (np.radians(lat), np.radians(lon))
-
-    lat, lon = convert()
-    bad = ~((np.abs(lat) <= np.pi / 2) & (np.abs(lon) <= 2 * np.pi))
-    rows.refuse(
-        bad,
-        lambda row: f"no place on earth: {rows.raw[part.latitude][row]}, {rows.raw[part.longitude][row]} ({part.unit})",
-        "at no place on earth",
-    )
-    return lat[~bad], lon[~bad]
-
-
-def _on_the_globe(rows: _Rows, part: Any) -> tuple[Array, Array, Array | None]:
-    """Return latitude, longitude (rad) and height (m, or None) of rows with a global position."""
-    if part.geodetic is None:
-        p_ecef = rows.si(part.position)
-        far = ~(np.abs(np.linalg.norm(p_ecef, axis=1) - SEMI_MAJOR_M) < FAR_M)
-        rows.refuse(
-            far,
-            lambda row: f"no place on earth: ({', '.join(f'{x:g}' for x in p_ecef[row])}) m, ECEF",
-            "at no place on earth",
-        )
-        return geodetic_from_ecef(p_ecef[~far])
-    lat, lon = _latitude_longitude(rows, part.geodetic)  # may drop rows, so it comes first
-    return lat, lon, None if part.geodetic.altitude is None else rows.si(part.geodetic.altitude)[:, 0]
-
-
-def _offset(rows: _Rows, part: Any) -> Array | None:
-    """Return (n, 3) m, the local offset from the global position; None without one."""
-    return None if part.geodetic is None or part.position is None else _enu(rows.si(part.position), part.frame)
-
-
-def _first_fix(part: Any, rows: _Rows, start_ns: int) -> tuple[float, float] | None:
-    """Return latitude and longitude (rad) of the first row at or after the IMU's start, local offset included."""
-    lat, lon, _ = _on_the_globe(rows, part)
-    after = np.flatnonzero(rows.t_ns >= start_ns)
-    if not len(after):
-        return None
-    row = after[:1]
-    p_ecef = ecef_from_geodetic(lat[row], lon[row], np.zeros(1))
-    offset = _offset(rows, part)
-    if offset is not None:
-        p_ecef = p_ecef + np.einsum("nji,nj->ni", enu_axes(lat[row], lon[row]), offset[row] * [1.0, 1.0, 0.0])
-    latitude, longitude, _ = geodetic_from_ecef(p_ecef)
-    return float(latitude[0]), float(longitude[0])
-
-
-def _position(rows: _Rows, part: Any, origin: tuple[float, float] | None) -> Array:
-    """Return (n, 3) m in W. Heights are above the sea surface, as those of the depth sensor, not the tangent plane."""
-    if not part.on_the_globe:
-        return _enu(rows.si(part.position), part.frame)
-    lat, lon, height = _on_the_globe(rows, part)
-    if origin is None:
-        raise DatasetError(f"{rows.opening.folder}: {rows.stream}: no fix after the IMU's start; give `origin`")
-    p = enu_from_geodetic(lat, lon, np.zeros(len(lat)), (*origin, 0.0))
-    p[:, 2] = 0.0 if height is None else height
-    offset = _offset(rows, part)
-    return p if offset is None else p + offset
-
-
-def _gps(part: d.GpsDescription, rows: _Rows, origin: tuple[float, float] | None) -> GpsStream:
-    _checked_width(rows, part, 3)
-    p_WG_W = _position(rows, part, origin)
-    p_WG_W = _without_outliers(rows, part.outliers, p_WG_W, "m")
-    p_WG_W = p_WG_W[_in_order(rows, part.every)]
-    sigma = _sigma(rows, part, 3)
+def _gps(part: d.GpsDescription, rows: Rows, origin: tuple[float, float] | None) -> GpsStream:
+    check_width(rows, part, 3)
+    rows.values["z"] = position(rows, part, origin)
+    drop_outliers(rows, part.outliers, "z", "m")
+    rows.put_in_order(part.every)
+    spread = sigma(rows, part, 3)
     if part.position is None and part.geodetic is not None and part.geodetic.altitude is None:
-        sigma[:, 2] = np.inf
-    return GpsStream(rows.t_ns, rows.received_ns, p_WG_W, sigma)
+        spread[:, 2] = np.inf
+    return GpsStream(rows.t_ns, rows.received_ns, rows.values["z"], spread)
 
 
 def _truth(
-    opening: _Opening, part: d.TruthDescription, rows: _Rows | None, origin: tuple[float, float] | None
+    opening: Opening, part: d.TruthDescription, rows: Rows | None, origin: tuple[float, float] | None
 ) -> Trajectory:
-    if part.tum is not None:
-        return Trajectory.from_tum(inside(opening.folder, part.tum), part.lookahead_s)
-    if part.trajectory is not None:
-        return _read_trajectory(inside(opening.folder, part.trajectory), part.lookahead_s)
-    assert rows is not None
-    R = None if part.attitude is None else _rotations(rows, part.attitude, origin)  # may drop rows, so it comes first
-    before = rows.number
-    p = _position(rows, part, origin)
+    if rows is None:
+        if part.tum is not None:
+            truth = Trajectory.from_tum(inside(opening.folder, part.tum), part.lookahead_s)
+        else:
+            truth = _read_trajectory(inside(opening.folder, str(part.trajectory)), part.lookahead_s)
+        return truth.select(opening.window("truth", part, truth.t_ns))
+    if part.attitude is not None:
+        _put_rotations(rows, part.attitude, origin)
+    p = rows.values["p"] = position(rows, part, origin)
     if part.height_m is not None:
         p[:, 2] = part.height_m
-    R = np.full((len(p), 3, 3), np.nan) if R is None else R[np.isin(before, rows.number)]
-    velocity = None if part.velocity is None else rows.si(part.velocity)
-    if velocity is not None:
-        velocity = velocity @ _enu_from_ecef(rows, origin).T if part.frame == "ECEF" else _enu(velocity, part.frame)
-    left = _in_order(rows, part.every)
-    v_WB_W = None if velocity is None else velocity[left]
-    return Trajectory(rows.t_ns, R[left], p[left], v_WB_W, lookahead_s=part.lookahead_s)
+    if part.velocity is not None:
+        v = rows.si(part.velocity)
+        rows.values["v"] = v @ enu_from_ecef(rows, origin).T if part.frame == "ECEF" else enu(v, part.frame)
+    rows.put_in_order(part.every)
+    found = rows.values
+    R = found["R"] if "R" in found else np.full((len(rows.t_ns), 3, 3), np.nan)
+    return Trajectory(rows.t_ns, R, found["p"], found.get("v"), lookahead_s=part.lookahead_s)
 
 
 def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     import pandas as pd
 
     try:
-        with path.open("rb") as file:  # of a name alone pandas might make an address or a home
-            frame = pd.read_parquet(file) if path.suffix == ".parquet" else pd.read_csv(file, **EXACT)
-        truth = Trajectory.from_pandas(frame, lookahead_s).with_rotations()
+        if path.suffix == ".parquet":
+            frame = read_known(path, COLUMNS)
+        else:
+            with path.open("rb") as file:  # of a name alone pandas might make an address or a home
+                frame = pd.read_csv(file, usecols=lambda name: name in COLUMNS, **EXACT)
+        truth = Trajectory.from_pandas(frame, lookahead_s).with_times_checked().with_rotations()
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}") from None
     except KeyError as error:

@@ -6,6 +6,7 @@ checks that need no data are made here, so no data is read before the whole desc
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
@@ -15,8 +16,8 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_va
 
 from ..errors import DatasetError, complaints, nearest
 from ..files import regular_file
-from ..formats.columns import Column, Part, Table
 from ..formats.recording import Recording, loader
+from ..formats.table import Column, Part, Table
 from ..mounting import Matrix, MountingSpec
 from ..quantities import DEGREE, Finite, Latitude, Longitude, NotNegative, Number, Positive, Vector, Whole
 from ..rig import ImuNoise
@@ -139,17 +140,76 @@ class Angles(Angle):
     width = 3
 
 
+def squared(units: Mapping[str, float]) -> dict[str, float]:
+    """Return the units of the variances of a quantity: (m/s)^2 and m^2/s^2 for m/s."""
+    found: dict[str, float] = {}
+    for unit, factor in units.items():
+        for two in ("^2", "²"):
+            found[f"({unit}){two}"] = found["/".join(part + two for part in unit.split("/"))] = factor**2
+    return found
+
+
+class Variances(Quantity):
+    """Variances instead of standard deviations, as in the diagonal of a covariance; correlations are not used."""
+
+
+class SpeedVariances(Variances):
+    """Of any number of velocities."""
+
+    units = squared(Speeds.units)
+
+
+class HeightVariance(Variances):
+    """Of one length."""
+
+    units = squared(Height.units)
+    width = 1
+
+
+class LengthVariances(HeightVariance):
+    """Of three lengths."""
+
+    width = 3
+
+
+class AngleVariances(Variances):
+    """Of one angle, or three."""
+
+    units = squared(Angle.units)
+
+
 class Geodetic(Part):
     """Latitude and longitude (north and east positive), and the height where there is one.
 
-    W is tangent at the origin; heights stay above the sea surface, as those of the depth sensor.
+    W is tangent at the origin; heights stay above the sea surface, as those of the depth sensor. A field may also say a
+    place in words: 41°11'06" N, or 8 42.36 W.
     """
 
-    latitude: Column
-    longitude: Column
-    unit: Literal["deg", "rad", "ddmm"] = "deg"
-    """ddmm is degrees · 100 + minutes, as NMEA writes it."""
+    latitude: Column | Annotated[tuple[Column, ...], Field(min_length=2, max_length=3)]
+    """One column; or those of the degrees, the minutes and perhaps the seconds."""
+    longitude: Column | Annotated[tuple[Column, ...], Field(min_length=2, max_length=3)]
+    unit: Literal["deg", "rad", "ddmm", "ddmmss", "degE7"] = "deg"
+    """ddmm is degrees · 100 + minutes, as NMEA writes it; ddmmss has seconds too; degE7 is 1e-7°, as in MAVLink."""
+    north_south: Column | None = None
+    """Column of N or S, which give the sign of the latitude."""
+    east_west: Column | None = None
+    """Column of E or W, which give the sign of the longitude."""
+    scale: Finite | tuple[Finite, Finite] = 1.0
+    """Of latitude and longitude, before the unit; −1 turns a sign."""
     altitude: Height | None = None
+
+    @property
+    def signs_unsaid(self) -> bool:
+        """Whether the unit has no sign as NMEA writes it, and nothing else says the hemispheres."""
+        said = {"scale", "north_south", "east_west"} & self.model_fields_set
+        return self.unit in ("ddmm", "ddmmss") and not said
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Every column of the two angles."""
+        angles = (self.latitude, self.longitude)
+        plain = [column for angle in angles for column in (angle if isinstance(angle, tuple) else (angle,))]
+        return (*plain, *(column for column in (self.north_south, self.east_west) if column is not None))
 
 
 class Attitude(Part):
@@ -169,11 +229,18 @@ class Attitude(Part):
         return self
 
 
-class Time(Part):
-    """When a row was true, and when it was received."""
+Unit = Literal["s", "ms", "us", "ns"]
 
-    column: Column | None = None
-    unit: Literal["s", "ms", "us", "ns"] = "s"
+
+class Time(Part):
+    """When a row was true, and when it was received: numbers in a unit, or dates by ISO 8601 (UTC without a zone)."""
+
+    column: Column | tuple[Column, Column] | None = None
+    """One column; or two whose sum is the time: seconds and nanoseconds, a date and a time of day."""
+    unit: Unit | tuple[Unit, Unit] = "s"
+    """Of plain numbers, one for each of two columns. Dates and durations say their own."""
+    wraps_at_s: Positive | None = None
+    """The stamps are a counter that begins again from zero here: 4294.967296 for 32 bits of microseconds."""
     row_rate_hz: Positive | None = None
     """Instead of a column: the time is the row's index at this rate."""
     start_s: Finite = 0.0
@@ -182,8 +249,19 @@ class Time(Part):
     """Added to the stamps, to bring this sensor's clock onto the log's."""
     delay_s: Annotated[Shift, Field(ge=0)] = 0.0
     """The stamp is the reception, and the row was true this much earlier."""
-    received: Column | None = None
-    """Column of the reception, same unit and clock."""
+    received: Column | tuple[Column, Column] | None = None
+    """Column of the reception (or two, as for `column`), same unit and clock."""
+
+    @property
+    def units(self) -> tuple[Unit, ...]:
+        """The unit of each column."""
+        return self.unit if isinstance(self.unit, tuple) else (self.unit,)
+
+    @property
+    def stamps(self) -> tuple[tuple[Column, ...], ...]:
+        """The columns of the stamp, and those of the reception."""
+        both = (self.column, self.received)
+        return tuple(each if isinstance(each, tuple) else (each,) for each in both if each is not None)
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -191,14 +269,27 @@ class Time(Part):
             raise ValueError("give one of `column` and `row_rate_hz`")
         if self.delay_s and self.received is not None:
             raise ValueError("give one of `delay_s` and `received`")
+        for columns in self.stamps:
+            if len(columns) != len(self.units):
+                raise ValueError(f"unit: {len(columns)} columns need {len(columns)} units, found {len(self.units)}")
         return self
 
 
 class Valid(Part):
-    """Rows are used only if this column holds one of these values."""
+    """Rows are used only if this column holds one of these values, which are numbers or text."""
 
     column: Column
-    values: Annotated[tuple[Finite, ...], Field(min_length=1)]
+    values: Annotated[tuple[Finite | str, ...], Field(min_length=1)]
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The values that are text."""
+        return tuple(value for value in self.values if isinstance(value, str))
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The values that are numbers."""
+        return tuple(value for value in self.values if not isinstance(value, str))
 
 
 class Outliers(Part):
@@ -224,6 +315,19 @@ class NoiseDescription(Part):
         return ImuNoise(**self.model_dump())
 
 
+class Window(Part):
+    """What is used of a log: from `from_s` on, and before `until_s`, counted from the file's first IMU sample."""
+
+    from_s: NotNegative = 0.0
+    until_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s ({self.until_s:g}) must be greater than from_s ({self.from_s:g})")
+        return self
+
+
 class SourceDescription(Part):
     """A source of columns, a time, and which rows are valid."""
 
@@ -239,11 +343,13 @@ class SourceDescription(Part):
         return self
 
 
-class StreamDescription(SourceDescription):
-    """The keys that all streams have."""
+class StreamDescription(SourceDescription, Window):
+    """The keys that all streams have. Readings outside the window are left out."""
 
+    drop_repeats: bool = False
+    """Leave out a row with the same values as the row before: a reading that was published again under a new stamp."""
     every: Annotated[Whole, Field(ge=1)] = 1
-    """Keep every n-th of the remaining rows."""
+    """Keep every n-th of the remaining rows; of the IMU's, the means of n."""
 
 
 class ImuDescription(StreamDescription):
@@ -259,15 +365,21 @@ class ImuDescription(StreamDescription):
 
 
 class AidingDescription(StreamDescription):
-    """An aiding sensor. Its sigma is fixed (the key with the unit), or `sigma` names columns with one per row."""
+    """An aiding sensor. Its sigma is fixed (the key with the unit), or `sigma` or `variance` names columns of it."""
 
     sigma_field: ClassVar[str]
     outliers: Outliers | None = None
 
+    @property
+    def spread(self) -> Quantity | None:
+        """The columns of sigma or variance, if there are any."""
+        return getattr(self, "sigma", None) or getattr(self, "variance", None)
+
     @model_validator(mode="after")
     def _one_sigma(self) -> Self:
-        if (getattr(self, "sigma", None) is None) == (getattr(self, self.sigma_field) is None):
-            raise ValueError(f"give one of `{self.sigma_field}` and `sigma` (columns)")
+        names = (self.sigma_field, "sigma", "variance")
+        if sum(getattr(self, name) is not None for name in names) != 1:
+            raise ValueError(f"give one of `{self.sigma_field}`, `sigma` (columns) and `variance` (columns)")
         if np.isinf(np.asarray(getattr(self, self.sigma_field) or 0.0)).all():
             raise ValueError(f"{self.sigma_field}: with no finite sigma the sensor measures nothing; leave it out")
         return self
@@ -285,6 +397,7 @@ class DvlDescription(AidingDescription):
     """Rotates the velocity into B's axes; its translation must be zero, since the DVL is B's origin."""
     sigma_m_s: Sigma | tuple[Sigma, ...] | None = None
     sigma: Speeds | None = None
+    variance: SpeedVariances | None = None
 
     @model_validator(mode="after")
     def _axes_fit(self) -> Self:
@@ -309,6 +422,7 @@ class DepthDescription(AidingDescription):
     positive: Literal["up", "down"] = "down"
     sigma_m: Sigma | None = None
     sigma: Height | None = None
+    variance: HeightVariance | None = None
     mounting: MountingSpec = MountingSpec()
 
 
@@ -339,6 +453,7 @@ class GpsDescription(AidingDescription, Placed):
     sigma_m: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
     """East, north, up; .inf for a component that was not measured. Without a height the third is .inf."""
     sigma: Lengths | None = None
+    variance: LengthVariances | None = None
     mounting: MountingSpec = MountingSpec()
 
     @model_validator(mode="after")
@@ -360,6 +475,7 @@ class HeadingDescription(AidingDescription):
     attitude: Attitude | None = None
     sigma_deg: Sigma | tuple[Sigma, Sigma, Sigma] | None = None
     sigma: Angle | Angles | None = None
+    variance: AngleVariances | None = None
     mounting: MountingSpec = MountingSpec()
 
     @model_validator(mode="after")
@@ -367,7 +483,7 @@ class HeadingDescription(AidingDescription):
         if (self.heading is None) == (self.attitude is None):
             raise ValueError("give one of `heading` and `attitude`")
         width = 1 if self.heading is not None else 3
-        given = self.sigma.columns if self.sigma is not None else self.sigma_deg
+        given = self.spread.columns if self.spread is not None else self.sigma_deg
         if isinstance(given, tuple) and len(given) != width:
             raise ValueError(f"expected {width} sigma, found {len(given)}")
         return self
@@ -381,9 +497,9 @@ def columns_of(part: BaseModel) -> list[Column]:
         if isinstance(value, Quantity | Attitude):
             found += value.columns
         elif isinstance(value, Geodetic):
-            found += [value.latitude, value.longitude, *columns_of(value)]
+            found += [*value.columns, *columns_of(value)]
         elif isinstance(value, Time):
-            found += [column for column in (value.column, value.received) if column is not None]
+            found += [column for columns in value.stamps for column in columns]
         elif isinstance(value, Valid):
             found.append(value.column)
     return list(dict.fromkeys(found))
@@ -399,7 +515,7 @@ class Streams(Part):
     heading: HeadingDescription | None = None
 
 
-class TruthDescription(Placed):
+class TruthDescription(Placed, Window):
     """The true trajectory: a TUM file, a table of ours (`trajectory`), or a stream like the others."""
 
     kind: Literal["truth", "reference"] = "truth"
@@ -412,6 +528,7 @@ class TruthDescription(Placed):
     message: Message | None = None
     time: Time | None = None
     valid: Valid | None = None
+    drop_repeats: bool = False
     every: Annotated[Whole, Field(ge=1)] = 1
     height_m: Finite | None = None
     """Constant height above the sea surface, if the source has no height."""
@@ -485,8 +602,8 @@ class PriorDescription(Part):
         return note("prior", off_rotation(np.array([self.R_WB])))
 
 
-class Description(Part):
-    """A log's description, `log.yaml`."""
+class Description(Window):
+    """A log's description, `log.yaml`. Its window holds for all streams and the truth."""
 
     name: str | None = None
     """Name of the log in tables; the folder's name if left out."""
@@ -500,6 +617,8 @@ class Description(Part):
     origin: Origin | None = None
     """The origin of W. If left out in a geodetic log, it is the first fix (of gps, else of truth) at or after the IMU's
     start, so that the vehicle starts at zero."""
+    max_wait_s: Positive | None = None
+    """How long the start may wait for its sensors; see `initialise`."""
     recording: SerializeAsAny[Recording] | None = None
     """The file with the streams' messages. Its `format` chooses the loader, which defines the other keys."""
     streams: Streams
@@ -511,6 +630,11 @@ class Description(Part):
         """The streams and the truth that are described, by name."""
         named = {name: getattr(self.streams, name) for name in Streams.model_fields} | {"truth": self.truth}
         return {name: part for name, part in named.items() if part is not None}
+
+    def window(self, part: Window) -> Window:
+        """Return what of a stream or of the truth is used: its own window within that of the log."""
+        ends = [each.until_s for each in (self, part) if each.until_s is not None]
+        return Window.model_construct(from_s=max(self.from_s, part.from_s), until_s=min(ends, default=None))
 
     @model_validator(mode="after")
     def _messages_have_a_recording(self) -> Self:

@@ -31,7 +31,8 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
         name_or_folder: a folder with a log.yaml, by its path or by its name in `data`; or a catalog entry's name, or
             its recording's folder; or a description file (.yaml), whose files lie in `data`, or next to it.
         data: folder whose subfolders are the recordings; FATHOM_DATA when left out.
-        repair: drop rows that are not finite or out of order, and count them in the log's notes, instead of an error.
+        repair: drop rows that are not finite or out of order, at most half of a stream, and count them in the log's
+            notes, instead of an error.
 
     A description names files in its folder, or in the data folder; it reads no others.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from driver import BLOCKS, error_states, heading_error_rad, nees, rmse_m, run_log
@@ -39,3 +41,11 @@ def test_both_find_the_same_errors(log: Log) -> None:
     assert rmse_m(log.truth, track) == pytest.approx(ate(log.truth, track).rmse_m)
     heading_deg = np.degrees(np.sqrt(np.mean(heading_error_rad(log.truth, track) ** 2)))
     assert heading_deg == pytest.approx(state_errors(log.truth, track).heading_deg)
+
+
+def test_a_hole_of_months_in_the_truth_costs_no_memory(log: Log) -> None:
+    truth = log.truth
+    far = np.where(truth.t_ns > 10 * 10**9, truth.t_ns + 100 * 86_400 * 10**9, truth.t_ns)
+    ticks = drive.score_ticks(replace(log, truth=replace(truth, t_ns=far)), 1e-3)  # a grid would need 69 GB
+    assert set(ticks.tolist()) <= set(far.tolist())
+    assert {far[0], far[-1]} <= set(ticks.tolist())

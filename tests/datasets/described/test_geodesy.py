@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fathom.datasets.described.conversion import degrees_from_ddmm
 from fathom.datasets.described.geodesy import ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
+from fathom.datasets.places import radians
 
 
 def test_the_ellipsoid_passes_through_its_known_points():
@@ -42,4 +42,4 @@ def test_axes_are_a_right_handed_triad_with_up_along_the_normal():
 
 
 def test_ddmm_keeps_its_sign():
-    np.testing.assert_allclose(degrees_from_ddmm(np.array([4212.225, -306.2832])), [42.20375, -3.10472])
+    np.testing.assert_allclose(radians(np.array([4212.225, -306.2832]), "ddmm"), np.radians([42.20375, -3.10472]))
