@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from ..datasets.errors import FathomError
 
-class ExperimentError(ValueError):
+
+class ExperimentError(FathomError):
     """An experiment file cannot be used; says which file, which key, and what to write instead."""

@@ -1,4 +1,4 @@
-"""`DatasetError`, the one exception of this package that a caller might catch, and the wording of its messages."""
+"""Errors that a user can correct, and the wording of their messages."""
 
 from __future__ import annotations
 
@@ -14,8 +14,31 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 
-class DatasetError(ValueError):
-    """A log, a description or a trajectory file cannot be used; the message says what, where and what to do."""
+def shown(text: str) -> str:
+    r"""Return a text as a terminal, a page or a table may show it: what cannot be printed stands there as its code.
+
+    These are control characters (line ends too), marks that turn the direction of writing, and lone surrogates: they
+    come from files and names of other people, and could hide, forge or colour what we say. "\x1b[2J" is shown so.
+    """
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+class FathomError(ValueError):
+    """What a user can correct; the message says what, where and what to do.
+
+    Args:
+        lines: of the message, each shown as `shown` does.
+    """
+
+    def __init__(self, *lines: str) -> None:
+        super().__init__(*map(shown, lines))
+
+    def __str__(self) -> str:
+        return "\n".join(self.args)
+
+
+class DatasetError(FathomError):
+    """A log, a description or a trajectory file cannot be used."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -32,8 +55,8 @@ def nearest_file(path: Path, *, folders: bool = False) -> str:
 
 
 def one_line(error: Exception) -> str:
-    """Return the class and the message of an error, on one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    """Return the class and the message of an error, on one line, as `shown` does."""
+    return shown(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
 def not_loaded(point: EntryPoint, error: Exception) -> str:

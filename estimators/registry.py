@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from ..datasets.errors import complaints, nearest, not_loaded
+from ..datasets.errors import FathomError, complaints, nearest, not_loaded
 from .batch import BatchSmoother
 from .dead_reckoning import DeadReckoning
 from .filters.eskf import ErrorStateKalmanFilter
@@ -34,7 +34,7 @@ ESTIMATORS: dict[str, Any] = {
 }
 
 
-class EstimatorError(ValueError):
+class EstimatorError(FathomError):
     """No estimator of that name, or an option that it does not have or cannot take."""
 
 

@@ -32,12 +32,9 @@ class Verb(TyperCommand):
             with on_interrupt("interrupted"):
                 return super().invoke(ctx)
         except ValueError as error:
-            from ...datasets.errors import DatasetError
-            from ...estimators.registry import EstimatorError
-            from ..errors import ExperimentError
-            from ..metrics.association import ScoreError
+            from ...datasets.errors import FathomError
 
-            if not isinstance(error, DatasetError | EstimatorError | ExperimentError | ScoreError):
+            if not isinstance(error, FathomError):
                 raise
             refuse(" ".join(str(error).split()))
 
@@ -60,4 +57,6 @@ def refuse(message: str) -> None:
 
 def say(message: str) -> None:
     """Print on standard error."""
-    print(message, file=sys.stderr)
+    from ...datasets.errors import shown
+
+    print(shown(message), file=sys.stderr)

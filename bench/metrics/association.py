@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...datasets.errors import FathomError
 from ...datasets.state import TimeArray
 from ...datasets.trajectory import Trajectory
 
 
-class ScoreError(ValueError):
+class ScoreError(FathomError):
     """A score is not defined for these trajectories; the message says why and what to do. Tables leave it out."""
 
 

@@ -540,7 +540,7 @@ def _checked(model: type[Checked], raw: dict[Any, Any], where: str, above: tuple
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise DatasetError(f"{where}: " + f"\n{where}: ".join(complaints(error, model, above))) from None
+        raise DatasetError(*(f"{where}: {complaint}" for complaint in complaints(error, model, above))) from None
     except (RecursionError, OverflowError) as error:
         raise DatasetError(f"{where}: cannot be understood: {error}") from None
 
