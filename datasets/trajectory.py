@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
+from .files import regular_file
 from .state import DIM, Array, Belief, NavState, TimeArray
 from .times import seconds_to_ns
 
@@ -110,8 +111,9 @@ class Trajectory:
         q_xyzw = Rotation.from_matrix(self.R_WB).as_quat(canonical=True)
         with Path(path).open("w") as file:
             for t_ns, p, q in zip(self.t_ns.tolist(), self.p_WB_W.tolist(), q_xyzw.tolist(), strict=True):
-                seconds, rest = divmod(t_ns, 1_000_000_000)
-                file.write(f"{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
+                seconds, rest = divmod(abs(t_ns), 1_000_000_000)
+                sign = "-" if t_ns < 0 else ""
+                file.write(f"{sign}{seconds}.{rest:09d} " + " ".join(repr(x) for x in (*p, *q)) + "\n")
 
     @classmethod
     def from_tum(cls, path: Path | str, lookahead_s: float = 0.0) -> Trajectory:
@@ -121,10 +123,10 @@ class Trajectory:
             DatasetError: names the file: it is missing or cannot be read, a row without eight numbers, a quaternion
                 more than 1e-3 from unit length, an invalid time, or times out of order.
         """
-        path = Path(path)
+        path = regular_file(Path(path))
         t_ns, poses = array("q"), array("d")
         try:
-            with path.open(encoding="utf-8", errors="replace") as file:
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
                 for number, line in enumerate(file, 1):
                     fields = line.replace(",", " ").split()
                     if not fields or fields[0].startswith("#"):
@@ -135,12 +137,8 @@ class Trajectory:
                         raise DatasetError(f"{path}: line {number}: {error}") from None
                     t_ns.append(stamp_ns)
                     poses.extend(pose)
-        except FileNotFoundError:
-            raise DatasetError(f"{path}: no such file") from None
-        except DatasetError:
-            raise
-        except (OSError, ValueError) as error:  # ValueError: a null character in the name
-            raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
         if not t_ns:
             raise DatasetError(f"{path}: no poses; expected lines of t x y z qx qy qz qw")
         values = np.array(poses).reshape(-1, 7)

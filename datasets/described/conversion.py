@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
+from ..files import regular_file
 from ..formats.columns import EXACT, Columns, read_table
 from ..formats.recording import Recording, Wanted
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
@@ -668,8 +669,7 @@ def _truth(
 def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:
     import pandas as pd
 
-    if not path.is_file():
-        raise DatasetError(f"{path}: no such file")
+    regular_file(path)
     try:
         frame = pd.read_parquet(path) if path.suffix == ".parquet" else pd.read_csv(path, **EXACT)
         truth = Trajectory.from_pandas(frame, lookahead_s)

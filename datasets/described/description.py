@@ -14,6 +14,7 @@ import yaml
 from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_validator
 
 from ..errors import DatasetError, complaints, nearest
+from ..files import regular_file
 from ..formats.columns import Column, Part, Table
 from ..formats.recording import Recording, loader
 from ..mounting import Matrix, MountingSpec
@@ -516,6 +517,7 @@ def read_description(path: Path) -> Description:
     Raises:
         DatasetError: names the file, the key, what is wrong, and the nearest known key.
     """
+    regular_file(path)
     try:
         raw = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:

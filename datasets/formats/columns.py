@@ -13,7 +13,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from ..errors import DatasetError, nearest, nearest_file
+from ..errors import DatasetError, nearest
+from ..files import regular_file
 
 EXACT: dict[str, Any] = (
     {} if tuple(map(int, pd.__version__.split(".")[:2])) >= (3, 1) else {"float_precision": "round_trip"}
@@ -73,9 +74,7 @@ def read_table(folder: Path, table: Table, columns: Collection[Column], times: C
     """
     if table.file is None:
         return _read_arrays(folder, table.arrays, [*columns, *times])
-    path = folder / table.file
-    if not path.is_file():
-        raise DatasetError(f"{path}: no such file{nearest_file(path)}")
+    path = regular_file(folder / table.file)
     wanted = dict.fromkeys([*columns, *times])
     try:
         pieces = (
@@ -117,9 +116,7 @@ def _read_arrays(folder: Path, arrays: Mapping[str, str], wanted: Collection[Col
     """Read NumPy arrays of equal length; `name.0`, `name.1` are the columns of a two-dimensional one."""
     found: dict[str, NDArray[Any]] = {}
     for name, file in arrays.items():
-        path = folder / file
-        if not path.is_file():
-            raise DatasetError(f"{path}: no such file{nearest_file(path)}")
+        path = regular_file(folder / file)
         try:
             values = np.load(path, mmap_mode="r", allow_pickle=False)
         except Exception as error:  # numpy raises many kinds for a file that is not what it seems

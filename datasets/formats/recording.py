@@ -19,7 +19,8 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from ..errors import DatasetError, nearest, nearest_file, not_loaded
+from ..errors import DatasetError, nearest, not_loaded
+from ..files import regular_file
 
 LOADERS = {
     "ardupilot": "ardupilot:ArduPilotRecording",
@@ -106,12 +107,9 @@ class Recording(BaseModel):
         """Return the path of the recording.
 
         Raises:
-            DatasetError: it does not exist; names the nearest file that does.
+            DatasetError: it does not exist (with the nearest file that does), or is no file or folder.
         """
-        path = folder / self.file
-        if not path.exists():
-            raise DatasetError(f"{path}: no such file{nearest_file(path, folders=True)}")
-        return path
+        return regular_file(folder / self.file, or_folder=True)
 
 
 def known_formats() -> list[str]:

@@ -624,7 +624,7 @@ def test_what_is_wrong_in_a_tum_file_names_the_file(tmp_path, text, message):
     ("name", "why"),
     [
         ("none.tum", "no such file"),
-        ("", "cannot be read: Is a directory"),
+        ("", "expected a file, found a folder"),
         ("x" * 300, "cannot be read: File name too long"),
         ("a\0b", "cannot be read: embedded null byte"),
     ],

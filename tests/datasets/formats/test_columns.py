@@ -209,6 +209,21 @@ def test_memory_is_that_of_the_wanted_columns(tmp_path, suffix):
 # -- TUM
 
 
+@pytest.mark.parametrize("t_ns", [[-1_500_000_000, -500_000_000, -1, 0, 1], [-800_000_000, -500_000_001]])
+def test_times_before_zero_keep_their_sign_and_order_in_a_tum_file(tmp_path, t_ns):
+    times = np.array(t_ns, np.int64)
+    Trajectory(times, np.tile(np.eye(3), (len(times), 1, 1)), np.zeros((len(times), 3))).to_tum(tmp_path / "a.tum")
+    np.testing.assert_array_equal(Trajectory.from_tum(tmp_path / "a.tum").t_ns, times)
+    written = [line.split()[0] for line in (tmp_path / "a.tum").read_text().splitlines()]
+    assert [Decimal(text) * 10**9 for text in written] == t_ns
+
+
+@pytest.mark.parametrize("first", ["", "# pose\n"])
+def test_a_byte_order_mark_before_a_tum_file_is_no_number(tmp_path, first):
+    (tmp_path / "a.tum").write_text(f"{first}0.5 1 2 3 0 0 0 1\n", encoding="utf-8-sig")
+    assert Trajectory.from_tum(tmp_path / "a.tum").t_ns.tolist() == [500_000_000]
+
+
 def test_a_tum_file_keeps_nanoseconds_and_numbers_its_lines(tmp_path):
     path = tmp_path / "a.tum"
     path.write_text("# t x y z q\n\n1700000000.000000001, 1,2,3, 0,0,0,1\r\n1700000000.000000002 4 5 6 0 0 1 0\n")
