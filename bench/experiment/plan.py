@@ -8,11 +8,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
-from ...datasets.errors import complaints, nearest
+from ...datasets.errors import DatasetError, complaints, nearest
+from ...datasets.yaml_file import read_yaml
 from ..errors import ExperimentError
 from ..metrics.comparison import Comparison
 from ..metrics.scoring import Scoring
@@ -84,9 +84,9 @@ class Experiment(Settings):
         """
         path = find_experiment(name_or_path)
         try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-            raise ExperimentError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from None
+            content = read_yaml(path)
+        except DatasetError as error:
+            raise ExperimentError(str(error)) from None
         if not isinstance(content, dict):
             raise ExperimentError(f"{path}: expected keys such as `name`, `logs`, `estimators`, found {content!r:.60}")
         return cls.from_dict({"name": path.stem} | content, str(path))
