@@ -42,13 +42,12 @@ def read_yaml(path: Path) -> Any:
         DatasetError: it cannot be read, is no YAML, holds a key twice (names both lines), or is larger than the bounds
             of this module; names file and line.
     """
+    if regular_file(path).stat().st_size > MOST_BYTES:
+        raise DatasetError(f"{path}: larger than {MOST_BYTES >> 20} MiB, which no file of YAML should be")
     try:
-        with regular_file(path).open("rb") as stream:
-            data = stream.read(MOST_BYTES + 1)
+        data = path.read_bytes()
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
-    if len(data) > MOST_BYTES:
-        raise DatasetError(f"{path}: larger than {MOST_BYTES >> 20} MiB, which no file of YAML should be")
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
