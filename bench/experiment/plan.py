@@ -32,6 +32,10 @@ __all__ = [
 ]
 
 
+MOST_RUNS = 1_000_000
+"""Of an experiment; a run takes at least some milliseconds, and its row some 10 kB while it is summarised."""
+
+
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class Experiment(Settings):
     """Every estimator on every log; simulated logs once per seed, recorded logs once.
@@ -49,6 +53,10 @@ class Experiment(Settings):
         refuse_twice("label", labels)
         refuse_twice("log name", names)
         refuse_twice("seed", self.seeds)
+        count = len(names) * len(self.seeds) * len(labels)
+        if count > MOST_RUNS:
+            sizes = f"{len(names)} logs · {len(self.seeds)} seeds · {len(labels)} estimators"
+            raise ValueError(f"{sizes} = {count} runs are more than {MOST_RUNS}; split the experiment")
         for label in (self.baseline, *(estimator.baseline for estimator in self.estimators)):
             refuse_unknown("baseline: no estimator has the label", label, labels)
         for log in self.logs:
