@@ -178,7 +178,7 @@ class _Reading:
         elif isinstance(record, self.of_mcap.Statistics):
             for number, count in record.channel_message_counts.items():
                 if number in self.channels:
-                    self.found.count("the statistics", self.channels[number].topic, count)
+                    self.found.count("the summary", self.channels[number].topic, count)
         elif record.id not in self.channels:
             channel = _channel(record, self.schemas.get(record.schema_id), self.types, self.path)
             self.channels[record.id] = channel

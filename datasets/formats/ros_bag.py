@@ -54,7 +54,10 @@ class RosRecording(TopicRecording):
             types = Definitions(own_definitions(folder, self.definitions), shipped_definitions())
             yield from _ros2_messages(path, types, self.distro, topics, found)
             return
-        for name in (self.file, *self.more):
+        names = (self.file, *self.more)
+        if len(set(names)) < len(names):
+            raise DatasetError(f"{path}: `more` names a file twice")
+        for name in names:
             part = self.model_copy(update={"file": name}).path(folder)
             yield from ros1_messages(part, topics, found)
 

@@ -32,10 +32,14 @@ LONGEST_PATH = 1000
 """Characters of a field's path."""
 MOST_DEFINITION = 1 << 20
 """Characters of the definition of a type with all that it contains: 1 MiB; large ones have some 30 kB."""
+MOST_IDL = 100_000
+"""Characters of a definition in IDL, whose parser takes 0.1 ms for each; nav_msgs/Odometry has 20,000."""
 
 _LINE = re.compile(
     r"(?P<base>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<most><=)?(?P<count>\d{0,9})\])?\s+(?P<name>[A-Za-z]\w*)"
 )
+_IDL_ASIDE = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*(?:.*?\*/|.*)|@[\w:]+\s*\(', re.DOTALL)
+"""Parts of IDL that may hold an opening parenthesis: text, comments, annotations."""
 
 
 class Field(NamedTuple):
@@ -126,8 +130,11 @@ def definitions_of(text: str, encoding: str, kind: str, where: str) -> dict[str,
         return parse_definitions(text, kind, where)
     if encoding not in ("ros2idl", "omgidl"):
         raise DatasetError(f"{where}: {kind} is defined in {encoding!r}, which is not supported")
-    if len(text) > MOST_DEFINITION:
-        raise DatasetError(f"{where}: {kind}: a definition of more than {MOST_DEFINITION} characters")
+    if len(text) > MOST_IDL:
+        raise DatasetError(f"{where}: {kind}: a definition of more than {MOST_IDL} characters of IDL")
+    if "(" in _IDL_ASIDE.sub(" ", text):
+        what = "an expression in parentheses, which takes the parser for ever"
+        raise DatasetError(f"{where}: the definition of {kind} has {what}; name its .msg file in `definitions`")
     with extra("ros"):
         from rosbags.typesys import Stores, get_types_from_idl, get_typestore
     try:

@@ -133,7 +133,8 @@ class Rows:
         try:
             self._bytes += self._struct.pack(*values)
         except struct.error:
-            self._widen(values)
+            if not self._widened(values):  # a number that no float64 can hold
+                raise
             self._bytes += self._struct.pack(*values)
 
     def arrays(self) -> list[NDArray[Any]]:
@@ -144,13 +145,18 @@ class Rows:
     def _dtype(self) -> np.dtype[Any]:
         return np.dtype([(f"c{i}", "<" + code) for i, code in enumerate(self._codes)])
 
-    def _widen(self, values: Sequence[Any]) -> None:
+    def _widened(self, values: Sequence[Any]) -> bool:
+        """Make floats of the integer columns in which a value is none; return whether there was such a column."""
+        whole = [isinstance(value, int) and -(2**63) <= value < 2**63 for value in values]
+        codes = [
+            "d" if code == "q" and not is_whole else code for code, is_whole in zip(self._codes, whole, strict=True)
+        ]
+        if codes == self._codes:
+            return False
         before = np.frombuffer(bytes(self._bytes), self._dtype())
-        for i, value in enumerate(values):
-            if self._codes[i] == "q" and not (isinstance(value, int) and -(2**63) <= value < 2**63):
-                self._codes[i] = "d"
-        self._struct = struct.Struct("<" + "".join(self._codes))
+        self._codes, self._struct = codes, struct.Struct("<" + "".join(codes))
         self._bytes = bytearray(before.astype(self._dtype()).tobytes())
+        return True
 
 
 class TopicRecording(Recording):

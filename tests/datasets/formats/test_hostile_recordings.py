@@ -23,7 +23,7 @@ from fathom.datasets.formats.imc import ImcRecording, parse_definitions
 from fathom.datasets.formats.mcap_file import McapRecording
 from fathom.datasets.formats.recording import Recording, Wanted
 from fathom.datasets.formats.ros_bag import RosRecording
-from fathom.datasets.formats.ros_messages import RosExtractor, numeric_fields
+from fathom.datasets.formats.ros_messages import RosExtractor, definitions_of, numeric_fields
 from fathom.datasets.formats.ros_messages import parse_definitions as parse_messages
 from google.protobuf import descriptor_pb2
 from limited import limited
@@ -150,6 +150,29 @@ def test_a_definition_that_grows_is_refused(tmp_path, kind):
     refused(bag(tmp_path / "x.bag", connection(text), SENT), tmp_path, "more than|two fields|not a line", "nothing")
 
 
+IDL = "module p {{ module msg {{ {} struct A {{ {} double x; }}; }}; }};"
+
+
+@pytest.mark.parametrize(
+    ("constant", "annotation", "says"),
+    [
+        ("const long K = ((((1))));", "", "an expression in parentheses"),
+        ("", "@default (value=((((1)))))", "an expression in parentheses"),
+        (" " * 100_000, "", "more than 100000 characters of IDL"),
+        ("/*" * 40_000, "", "cannot be understood"),
+    ],
+)
+def test_idl_that_takes_the_parser_for_ever_is_refused(constant, annotation, says):
+    text = IDL.format(constant, annotation)
+    with pytest.raises(DatasetError, match=says):
+        limited(lambda: definitions_of(text, "ros2idl", "p/msg/A", "x"), MEGABYTES)
+
+
+def test_parentheses_in_text_comments_and_annotations_of_idl_are_no_expressions():
+    text = IDL.format("/* (a) */ // (b)\n", '@verbatim (language="comment", text="const (m) \\" (") @unit (value="m")')
+    assert definitions_of(text, "ros2idl", "p/msg/A", "x") == {"p/A": (("x", "float64", None),)}
+
+
 def test_many_topics_of_large_types_are_listed_in_time(tmp_path):
     text = in_one_another(4, 9, "float64")  # 6561 fields
     records = [connection(text, number, b"/%d" % number) for number in range(300)]
@@ -239,6 +262,19 @@ def test_types_of_protocol_buffers_in_one_another_are_bounded(tmp_path, levels, 
 )
 def test_json_that_is_deep_or_huge_is_a_damaged_message(tmp_path, message):
     refused(mcap(tmp_path / "x.mcap", None, message), tmp_path, "are not what|no numeric field|Infinity|finite")
+
+
+def test_numbers_that_no_float_holds_do_not_copy_all_rows_each_time(tmp_path):
+    with (tmp_path / "x.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        for n in range(20_000):
+            writer.add_message(channel, n, b'{"x": 1.5}' if n % 3 else b'{"x": 1%s}' % (b"0" * 310), n)
+        writer.finish()
+    recording = McapRecording(format="mcap", file="x.mcap")
+    found = limited(lambda: recording.read(tmp_path, [Wanted("/a", None, ("x",))]), MEGABYTES, 10)
+    assert len(found.columns[0]["x"]) == 13_333
 
 
 # --------------------------------------------------------------------------------------------------------------- SQLite

@@ -175,12 +175,15 @@ def test_a_split_bag_is_read_in_its_files(tmp_path):
 
 
 def test_files_that_metadata_does_not_name_or_names_twice_are_told(tmp_path):
+    (tmp_path / "x.bag").touch()
     for part in range(3):
         database(tmp_path / f"x_{part}.db3", range(3 * part, 3 * part + 3))
     metadata(tmp_path, ["x_0.db3", "x_2.db3"], {"/a": 6})
     found, messages = read(tmp_path, file=".", definitions=("A.msg",))
     assert len(found) == 6
     assert messages.notes[0].endswith(": not read, since metadata.yaml does not name them: x_1.db3")
+    with pytest.raises(DatasetError, match="`more` names a file twice"):
+        read(tmp_path, file="x.bag", more=("y.bag", "x.bag"))
     metadata(tmp_path, ["x_0.db3", "x_0.db3"], {"/a": 6})
     with pytest.raises(DatasetError, match="a file is named twice"):
         read(tmp_path, file=".", definitions=("A.msg",))
@@ -226,14 +229,14 @@ def mcap(path: Path, compression: CompressionType, chunk_size: int = 1 << 20) ->
     return bytearray(path.read_bytes())
 
 
-def test_fewer_messages_than_the_statistics_of_a_file_count_are_told(tmp_path):
+def test_fewer_messages_than_the_summary_of_a_file_counts_are_told(tmp_path):
     data = mcap(tmp_path / "x.mcap", CompressionType.NONE, 300)
     data[data.index(b'{"x": 1.0}') + 6] ^= 1  # its chunk no longer fits its checksum
     (tmp_path / "x.mcap").write_bytes(data)
     found, messages = read(tmp_path, McapRecording, file="x.mcap")
     lost = N - len(found)
     assert 0 < lost < 20
-    assert f"/a: {lost} of the {N} messages that the statistics counts are missing" in messages.notes
+    assert f"/a: {lost} of the {N} messages that the summary counts are missing" in messages.notes
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
