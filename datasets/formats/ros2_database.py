@@ -74,6 +74,9 @@ def sqlite_messages(
 def _with_journals(plain: Path, path: Path, found: ScanResult) -> Iterator[tuple[str, int]]:
     """Yield the address and the size of the database: itself if no journal lies beside it, else a copy with it."""
     beside = [plain.with_name(plain.name + suffix) for suffix in ("-wal", "-journal")]
+    for journal in beside:
+        if journal.is_symlink():
+            raise DatasetError(f"{journal}: a link; put the file itself beside {plain.name}, or remove the link")
     beside = [journal for journal in beside if _has_content(journal)]
     if not beside:
         yield f"{plain.as_uri()}?mode=ro&immutable=1", plain.stat().st_size

@@ -106,9 +106,6 @@ def _euler_angles(source: str, path: Trajectory) -> Array:
 def _lay(source: str, t_s: Array, poses: Array, spacing_s: float | None) -> BSpline:
     if spacing_s is None:
         return make_interp_spline(t_s, poses, k=DEGREE_OF_SPLINES)
-    too_few = f"{source}: {len(t_s)} poses are too few for knots every {spacing_s:g} s; make path_spacing_s longer"
-    if (t_s[-1] - t_s[0]) > len(t_s) * spacing_s:
-        raise DatasetError(too_few)
     count = max(1, round((t_s[-1] - t_s[0]) / spacing_s))
     breaks = np.linspace(t_s[0], t_s[-1], count + 1)
     empty = np.flatnonzero(np.histogram(t_s, breaks)[0] == 0)
@@ -121,7 +118,9 @@ def _lay(source: str, t_s: Array, poses: Array, spacing_s: float | None) -> BSpl
     try:
         return make_lsq_spline(t_s, poses, knots, k=DEGREE_OF_SPLINES)
     except (ValueError, np.linalg.LinAlgError):
-        raise DatasetError(too_few) from None
+        raise DatasetError(
+            f"{source}: {len(t_s)} poses are too few for knots every {spacing_s:g} s; make path_spacing_s longer"
+        ) from None
 
 
 def _columns(spline: BSpline, columns: slice) -> BSpline:

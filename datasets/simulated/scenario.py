@@ -35,13 +35,6 @@ from .specs import (
 CLEARANCE_M = 0.5
 """Least height of a mission's deepest point above the seabed."""
 
-MOST_SAMPLES = 20_000_000
-"""Of all sensors together, and 10 points of the path a second: some 10 GB, a day of an IMU at 200 Hz."""
-MOST_TURNS = 1_000_000
-"""Of a mission: one of a metre each, along a thousand kilometres."""
-PATH_HZ = 10.0
-"""Points of the path, as `missions` draws it."""
-
 CALLED_NOW = {
     "speed_mps": "speed_m_s",
     "gravity_mps2": "gravity_m_s2",
@@ -126,23 +119,6 @@ class Scenario:
         if name not in known:
             raise ValueError(f"no mission {name!r}{nearest(name, known)}; known: {', '.join(known)}")
         return name
-
-    @model_validator(mode="after")
-    def _can_be_held(self) -> Scenario:
-        rates_hz = PATH_HZ + sum(
-            spec.rate_hz for name in ("imu", *SENSORS) if (spec := getattr(self, name)) is not None
-        )
-        if self.duration_s * rates_hz > MOST_SAMPLES:
-            raise ValueError(
-                f"{self.duration_s:g} s at {rates_hz:g} samples a second, all sensors and the path together, are more "
-                f"than {MOST_SAMPLES}; make duration_s or a rate_hz smaller"
-            )
-        if self.mission in MISSIONS:
-            plan = MISSIONS[self.mission]
-            turn_m = [plan.legs * self.leg_m + abs(math.radians(deg)) * self.turn_radius_m for deg in plan.turns_deg]
-            if self.duration_s * self.speed_m_s * len(turn_m) > MOST_TURNS * sum(turn_m):
-                raise ValueError(f"{self.mission}: more than {MOST_TURNS} turns; make leg_m or turn_radius_m larger")
-        return self
 
     @model_validator(mode="after")
     def _saw_has_teeth(self) -> Scenario:

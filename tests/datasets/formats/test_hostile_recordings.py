@@ -321,6 +321,34 @@ def test_a_statement_that_takes_more_steps_than_its_file_has_rows_is_ended(tmp_p
     assert 0 < held.count < 20_000
 
 
+def test_pages_that_are_each_others_children_many_times_are_read_once(tmp_path):
+    """Every inner page names its first child in place of all: of some pages, 50^3 paths lead to the same rows."""
+    page = 512
+    with sqlite3.connect(tmp_path / "x.db3") as database:
+        database.execute(f"PRAGMA page_size = {page}")
+        database.execute(TOPICS)
+        database.execute(MESSAGES)
+        database.execute("INSERT INTO topics VALUES (1, '/a', 'p/A', 'cdr'), (2, '/b', 'p/A', 'cdr')")
+        rows = ((n, n, bytes(20)) for n in range(1, 60_000))
+        database.executemany("INSERT INTO messages VALUES (?, 2, ?, ?)", rows)
+        (root,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+    database.close()
+    data = bytearray((tmp_path / "x.db3").read_bytes())
+    depth, at = 0, (root - 1) * page
+    while data[at] == 5:  # an inner page of a table
+        (count,) = struct.unpack_from(">H", data, at + 3)
+        cells = [at + cell for cell in struct.unpack_from(f">{count}H", data, at + 12)]
+        first = bytes(data[cells[0] : cells[0] + 4])
+        for place in (*cells, at + 8):
+            data[place : place + 4] = first
+        depth, at = depth + 1, (int.from_bytes(first, "big") - 1) * page
+    assert depth == 3
+    (tmp_path / "x.db3").write_bytes(data)
+    recording = RosRecording(format="ros", file="x.db3")
+    assert [info.count < 50 for info in listed(recording, tmp_path)] == [True]
+    refused(recording, tmp_path, "rows are out of order")
+
+
 def test_a_packed_database_that_is_a_bomb_is_refused(tmp_path):
     (tmp_path / "x.db3.zstd").write_bytes(PACK["zstd"]())
     refused(RosRecording(format="ros", file="x.db3.zstd"), tmp_path, "unpack to more than 100 times their size")

@@ -117,6 +117,14 @@ def test_a_write_ahead_log_beside_the_target_of_a_link_is_read(tmp_path):
     assert read(tmp_path, file="linked.db3", definitions=("lost/A.msg",))[0] == tenths(N)
 
 
+def test_a_journal_that_is_a_link_is_not_followed(tmp_path):
+    database(tmp_path / "x.db3")
+    (tmp_path / "elsewhere").write_bytes(b"somebody's")
+    (tmp_path / "x.db3-wal").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DatasetError, match=r"x\.db3-wal: a link"):
+        read(tmp_path, file="x.db3", definitions=("A.msg",))
+
+
 def test_what_a_rollback_journal_takes_back_is_not_read(tmp_path):
     database(tmp_path / "bag" / "x.db3", range(N))
     folder = lose_power(tmp_path / "bag" / "x.db3", tmp_path / "lost", range(N, 3000), "DELETE")

@@ -136,8 +136,6 @@ def test_gaps_are_refused_where_knots_would_find_no_pose():
         fly(scenario(path_spacing_s=1.0), 1, path.select(np.abs(np.arange(len(path)) - 102) > 5))
     with pytest.raises(DatasetError, match=r"too few for knots every 0\.4 s"):
         fly(scenario(path_spacing_s=0.4), 1, path)
-    with pytest.raises(DatasetError, match=r"too few for knots every 1e-300 s"):
-        fly(scenario(path_spacing_s=1e-300), 1, path)
 
 
 def test_paths_and_missions_go_together(tmp_path):
