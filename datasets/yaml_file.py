@@ -30,7 +30,7 @@ MOST_LEVELS = 50
 """Lists and mappings in one another; our deepest file has 9."""
 LONGEST_NUMBER = 100
 """Characters. 64 bits need 20, a float 24; more is a mistake, and slow to read."""
-PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("seq", "map")}
+_PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in ("seq", "map")}
 _NUMBERS = {f"tag:yaml.org,2002:{kind}" for kind in ("int", "float")}
 _MERGE = "tag:yaml.org,2002:merge"
 
@@ -82,7 +82,10 @@ def _hint(what: str) -> str:
     return ""
 
 
-class _Builder(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):
+_Loader: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader
+
+
+class _Builder(_Loader):
     """Builds the value of a document, event by event."""
 
     def __init__(self, text: str, where: str) -> None:
@@ -130,7 +133,7 @@ class _Builder(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):
             value = self._scalar(event)
         else:
             self._count(event, 1)
-            if event.tag is not None and event.tag not in PLAIN_TAGS:
+            if event.tag is not None and event.tag not in _PLAIN:
                 raise self._refused(event, f"the tag {event.tag[:60]} is not known here; leave it out")
             value = self._list(level) if isinstance(event, yaml.SequenceStartEvent) else self._mapping(level)
         if event.anchor is not None:
@@ -146,7 +149,7 @@ class _Builder(yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader):
         if tag in _NUMBERS and len(event.value) > LONGEST_NUMBER:
             raise self._refused(event, f"a number of more than {LONGEST_NUMBER} characters; put text in quotes")
         construct = self.yaml_constructors.get(tag)
-        if construct is None or tag in PLAIN_TAGS:
+        if construct is None or tag in _PLAIN:
             raise self._refused(event, f"the tag {tag[:60]} is not known here; leave it out")
         try:
             return construct(self, yaml.ScalarNode(tag, event.value, event.start_mark, event.end_mark))
