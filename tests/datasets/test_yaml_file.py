@@ -51,7 +51,7 @@ def test_a_mark_of_byte_order_is_no_matter(tmp_path: Path, encoding: str) -> Non
         ("- {p: 1,\n   p: 2}", "line 2: the key 'p' stands there twice, in line 1 and in line 2"),
         ("a: &x {p: 1}\nb: {<<: *x, <<: *x}\n", "line 2: the key '<<' stands there twice"),
         ("true: 1\n1: 2\n", "stands there twice"),
-        ("a: [1\nb: 2\n", "x: line 2: not YAML: did not find expected ',' or ']'"),
+        ("a: [1\nb: 2\n", "x: line 2: not YAML: .*expected ',' or ']'"),
         ("a:\n\tb: 1\n", "line 2: not YAML: .*; indent with blanks, not with tabs"),
         ("a: b: c\n", "line 1: not YAML: .*put text that contains `: ` in quotes"),
         ("a: 1\n---\nb: 2\n", "line 2: a second document begins"),
