@@ -65,6 +65,8 @@ def not_loaded(point: EntryPoint, error: Exception) -> str:
     return f"cannot be loaded from the package {package!r}: {one_line(error)}"
 
 
+MOST_COMPLAINTS = 50
+"""About one file; a screen full. A long list of wrong values has one for each."""
 LONGEST_VALUE = 60
 """Characters of an invalid value that an error shows."""
 
@@ -86,7 +88,8 @@ def complaints(
     # where no item of a list fits, pydantic also says that the list is empty
     every = [problem for problem in every if not (problem["type"] == "too_short" and problem["input"])]
     every.sort(key=lambda problem: problem["type"] not in UNKNOWN_KEY)
-    return list(dict.fromkeys(_complaint(problem, model, above, renamed or {}) for problem in every))
+    told = list(dict.fromkeys(_complaint(problem, model, above, renamed or {}) for problem in every[:MOST_COMPLAINTS]))
+    return told if len(every) <= MOST_COMPLAINTS else [*told, f"and {len(every) - MOST_COMPLAINTS} more of this kind"]
 
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")

@@ -54,11 +54,10 @@ def _logs() -> dict[str, str]:
 
 
 def _experiments() -> dict[str, str]:
-    import yaml
-
+    from ...datasets.yaml_file import read_yaml
     from ..experiment.packaged import shipped_experiments
 
-    return {name: yaml.safe_load(path.read_text())["description"] for name, path in shipped_experiments().items()}
+    return {name: read_yaml(path)["description"] for name, path in shipped_experiments().items()}
 
 
 def _scores() -> dict[str, str]:

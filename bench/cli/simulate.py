@@ -34,15 +34,9 @@ def simulate(
 
 
 def _scenario(text: str) -> Scenario:
-    import yaml
-
-    from ...datasets.errors import DatasetError
     from ...datasets.simulated.scenario import Scenario
+    from ...datasets.yaml_file import read_yaml
 
     if not text.endswith((".yaml", ".yml")):
         return Scenario.from_dict({"mission": text})
-    try:
-        content = yaml.safe_load(Path(text).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise DatasetError(f"{text}: not readable as YAML: {' '.join(str(error).split())}") from None
-    return Scenario.from_dict(content, text)
+    return Scenario.from_dict(read_yaml(Path(text)), text)

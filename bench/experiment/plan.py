@@ -8,11 +8,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
-from ...datasets.errors import complaints, nearest
+from ...datasets.errors import DatasetError, complaints, nearest
+from ...datasets.yaml_file import read_yaml
 from ..errors import ExperimentError
 from ..metrics.comparison import Comparison
 from ..metrics.scoring import Scoring
@@ -32,6 +32,10 @@ __all__ = [
 ]
 
 
+MOST_RUNS = 1_000_000
+"""Of an experiment; a run takes at least some milliseconds, and its row some 10 kB while it is summarised."""
+
+
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class Experiment(Settings):
     """Every estimator on every log; simulated logs once per seed, recorded logs once.
@@ -49,6 +53,10 @@ class Experiment(Settings):
         refuse_twice("label", labels)
         refuse_twice("log name", names)
         refuse_twice("seed", self.seeds)
+        count = len(names) * len(self.seeds) * len(labels)
+        if count > MOST_RUNS:
+            sizes = f"{len(names)} logs · {len(self.seeds)} seeds · {len(labels)} estimators"
+            raise ValueError(f"{sizes} = {count} runs are more than {MOST_RUNS}; split the experiment")
         for label in (self.baseline, *(estimator.baseline for estimator in self.estimators)):
             refuse_unknown("baseline: no estimator has the label", label, labels)
         for log in self.logs:
@@ -85,9 +93,9 @@ class Experiment(Settings):
         """
         path = find_experiment(name_or_path)
         try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-            raise ExperimentError(f"{path}: not readable as YAML: {' '.join(str(error).split())}") from None
+            content = read_yaml(path)
+        except DatasetError as error:
+            raise ExperimentError(str(error)) from None
         if not isinstance(content, dict):
             raise ExperimentError(f"{path}: expected keys such as `name`, `logs`, `estimators`, found {content!r:.60}")
         return cls.from_dict({"name": path.stem} | content, str(path))

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import product
+from math import prod
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
+
+MOST_POINTS = 10_000
+"""Of one grid: each is an estimator or a log of its own, with its row in every table."""
+LONGEST_WORDS = 500
+"""Characters that a value may add to the label of its point."""
 
 
 def named_axes(grid: Any) -> Any:
     """Return every axis of a grid as values by their words; a list of values has the words "path=value".
 
     Raises:
-        ValueError: an axis without values, or one that has the same words twice.
+        ValueError: an axis without values, or one that has the same words twice or long ones; or too many points.
     """
     if not isinstance(grid, Mapping):
         raise ValueError(f"expected a mapping of fields to lists of values, found {grid!r:.60}")
@@ -29,6 +35,12 @@ def named_axes(grid: Any) -> Any:
         axes[str(path)] = {str(words): value for words, value in named}
         if len(axes[str(path)]) < len(values):
             raise ValueError(f"{path}: a value is there twice; found {values!r:.60}")
+        if max(map(len, axes[str(path)])) > LONGEST_WORDS:
+            raise ValueError(f"{path}: a value of more than {LONGEST_WORDS} characters; write {{name: value}} for each")
+    count = prod(map(len, axes.values()))
+    if count > MOST_POINTS:
+        sizes = " · ".join(str(len(values)) for values in axes.values())
+        raise ValueError(f"{sizes} = {count} points are more than {MOST_POINTS}; leave some values out")
     return axes
 
 

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ...datasets.errors import shown
 from ...datasets.formats.recording import TopicInfo
 
 
@@ -21,6 +22,12 @@ def print_contents(held: Sequence[TopicInfo], console: Console) -> None:
         rate = f"{(each.count - 1) / each.span_s:.2f}" if each.span_s > 0 else "–"
         sender = "" if each.sender is None else str(each.sender)
         row = (each.message, each.kind, sender, f"{each.count:,}", rate, " ".join(each.fields))
-        table.add_row(*map(Text, row))
+        table.add_row(*map(Text, map(shown, row)))
     console.print(table)
+    for each in held:
+        if each.missing:
+            counted = (
+                f"{each.missing} of the {each.count + each.missing} messages that the recording counts are missing."
+            )
+            console.print(Text(f"{shown(each.message)}: {counted}"))
     console.print("No log.yaml describes it yet: docs/your-own-log.md shows how.", highlight=False)

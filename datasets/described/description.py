@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_validator
 
 from ..errors import DatasetError, complaints, nearest
-from ..files import regular_file
 from ..formats.recording import Recording, loader
 from ..formats.table import Column, Part, Table
 from ..mounting import Matrix, MountingSpec
@@ -23,6 +21,7 @@ from ..quantities import DEGREE, Finite, Latitude, Longitude, NotNegative, Numbe
 from ..rig import ImuNoise
 from ..rotations import complaint, is_rotation, note, off_rotation, orthonormalised
 from ..state import LIMIT_NS, Array, Belief, NavState
+from ..yaml_file import read_yaml
 
 Sigma = Annotated[Number, Field(gt=0)]
 """Infinite for a component that is not measured."""
@@ -650,13 +649,7 @@ def read_description(path: Path) -> Description:
     Raises:
         DatasetError: names the file, the key, what is wrong, and the nearest known key.
     """
-    regular_file(path)
-    try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError, RecursionError) as error:
-        raise DatasetError(f"{path}: not YAML: {str(error)[:300] or type(error).__name__}") from None
+    raw = read_yaml(path)
     if not isinstance(raw, dict):
         raise DatasetError(f"{path}: expected keys and values, found {type(raw).__name__}")
     return check_description(raw, str(path))

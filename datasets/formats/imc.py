@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..compiled import compiled
-from ..errors import DatasetError, nearest
+from ..errors import DatasetError, nearest, shown
 from ..files import inside
 from .recording import Messages, Recording, TopicInfo, Wanted, not_found
+from .unpacking import Bounded
 
 HEADER = np.dtype(
     [("sync", "<u2"), ("id", "<u2"), ("size", "<u2"), ("timestamp", "<f8"), ("src", "<u2"), ("src_ent", "u1"),
@@ -32,6 +33,8 @@ CHUNK_BYTES = 1 << 20
 """Read at a time: 1 MiB."""
 TYPES = {"int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4",
          "int64_t": "<i8", "fp32_t": "<f4", "fp64_t": "<f8"}  # fmt: skip
+MOST_DEFINITIONS = 8 << 20
+"""Bytes of an IMC.xml: 8 MiB, thirty times that of IMC 5.4."""
 BROKEN = (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, ValueError)
 """The exceptions of the standard library for a damaged archive."""
 
@@ -81,17 +84,30 @@ def built_in_layouts() -> dict[str, Layout]:
 
 
 def parse_definitions(xml: bytes, where: str) -> dict[str, Layout]:
-    """Return the layouts of the messages of an IMC.xml, up to the first field of variable size."""
+    """Return the layouts of the messages of an IMC.xml, up to the first field of variable size.
+
+    Raises:
+        DatasetError: it is no such list, or has a name or a number twice.
+    """
+    if b"<!ENTITY" in xml.replace(b"\0", b""):  # also as UTF-16
+        raise DatasetError(
+            f"{where}: not a list of IMC messages: it has entities, which can stand for any amount of text"
+        )
     try:
         root = ET.fromstring(xml)
-        layouts = {}
+        layouts: dict[str, Layout] = {}
+        numbers: set[int] = set()
         for message in root.iter("message"):
             fields = []
             for item in message.findall("field"):
                 if item.get("type") not in TYPES:
                     break
                 fields.append((str(item.get("abbrev")), TYPES[str(item.get("type"))]))
-            layouts[str(message.get("abbrev"))] = Layout(int(message.get("id", "-1")), np.dtype(fields))
+            name, layout = str(message.get("abbrev")), Layout(int(message.get("id", "-1")), np.dtype(fields))
+            if name in layouts or layout.mgid in numbers:
+                raise ValueError(f"the message {name} or its number {layout.mgid} stands there twice")
+            layouts[name] = layout
+            numbers.add(layout.mgid)
     except (ET.ParseError, ValueError) as error:
         raise DatasetError(f"{where}: not a list of IMC messages: {error}") from None
     return layouts
@@ -144,9 +160,13 @@ class ImcRecording(Recording):
         where = f"{folder / file}: {self.definitions}"
         with _opened(folder, file, member) as stream:
             try:
-                xml = stream.read()
+                xml = stream.read(MOST_DEFINITIONS + 1)
+            except DatasetError:
+                raise
             except BROKEN as error:
                 raise DatasetError(f"{where}: cannot be read: {error}") from None
+        if len(xml) > MOST_DEFINITIONS:
+            raise DatasetError(f"{where}: more than {MOST_DEFINITIONS >> 20} MiB; that is no list of IMC messages")
         return parse_definitions(xml, where)
 
 
@@ -177,6 +197,8 @@ def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
             if member not in members:
                 hint = nearest(member or "", members)
                 raise DatasetError(f"{path}: no member {member!r}{hint}; it holds {', '.join(members[:20])}")
+            if archive.getinfo(str(member)).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise DatasetError(f"{path}: {member}: only stored and deflated members can be read piece by piece")
             stream: IO[bytes] = archive.open(member)
         else:
             stream = path.open("rb")
@@ -188,7 +210,8 @@ def _opened(folder: Path, file: str, member: str | None) -> Iterator[Any]:
         raise DatasetError(f"{path}: cannot be opened: {error}") from None
     try:
         with stream:
-            yield gzip.GzipFile(fileobj=stream) if (member or file).endswith(".gz") else stream
+            plain: Any = gzip.GzipFile(fileobj=stream) if (member or file).endswith(".gz") else stream
+            yield Bounded(plain, str(path), path.stat().st_size)
     finally:
         if archive is not None:
             archive.close()
@@ -203,11 +226,13 @@ def scan(stream: IO[bytes], layouts: Mapping[str, Layout], source: int | None, w
     while not final:
         try:
             chunk = stream.read(CHUNK_BYTES)
+        except DatasetError:
+            raise
         except BROKEN as error:
             chunk, cut_off = b"", f" ({error})"
         final = not chunk
         data = np.frombuffer(carry + chunk, np.uint8)
-        offsets, done, new_gaps, new_skipped, in_gap = _messages(data, final, in_gap, CRC_TABLE)
+        offsets, done, new_gaps, new_skipped, in_gap = _messages(data, final, in_gap, CRC_TABLE, SHIFTS)
         messages, gaps, skipped = messages + len(offsets), gaps + new_gaps, skipped + new_skipped
         carry = data[done:].tobytes()
         if len(offsets):
@@ -227,7 +252,7 @@ def scan(stream: IO[bytes], layouts: Mapping[str, Layout], source: int | None, w
         notes.append(f"imc: {skipped} bytes belong to no whole message")
     if short:
         notes.append(f"imc: {short} messages shorter than their definition dropped")
-    return LsfRead({name: _stacked(kept, layouts[name]) for name, kept in rows.items()}, tuple(notes))
+    return LsfRead({name: _stacked(kept, layouts[name]) for name, kept in rows.items()}, tuple(map(shown, notes)))
 
 
 def _row_type(layout: Layout) -> np.dtype[Any]:
@@ -249,8 +274,11 @@ def _keep(
     """Append the wanted messages of a chunk to `rows`; return how many were shorter than their definition."""
     heads = data[offsets[:, None] + np.arange(HEADER.itemsize)].view(HEADER)[:, 0]
     ours = np.ones(len(heads), bool) if source is None else heads["src"] == source
+    present = set(np.unique(heads["id"]).tolist())
     short = 0
     for name, layout in layouts.items():
+        if layout.mgid not in present:
+            continue
         chosen = ours & (heads["id"] == layout.mgid)
         whole = chosen & (heads["size"] >= layout.fields.itemsize)
         short += int(np.count_nonzero(chosen & ~whole))
@@ -277,14 +305,39 @@ def crc_table() -> NDArray[np.uint16]:
 CRC_TABLE = crc_table()
 
 
+def shift_tables(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Return what 2^k zero bytes after it make of a CRC, (17, 2, 256): of its low and of its high byte, to be XORed.
+
+    A CRC is linear. So that of a message is the CRC of all up to its end, less that of all before it, which the
+    message's length has shifted on: crc(b) = crc(a + b) XOR shifted(crc(a), len(b)).
+    """
+    step = np.zeros((2, 256), np.uint16)
+    low = np.arange(256, dtype=np.uint16)
+    step[0], step[1] = table[low], low  # (crc >> 8) ^ table[crc & 0xFF]
+    levels = [step]
+    for _ in range(16):
+        last = levels[-1]
+        levels.append(last[0][last & 0xFF] ^ last[1][last >> 8])
+    return np.stack(levels)
+
+
+SHIFTS = shift_tables(CRC_TABLE)
+
+
 @compiled
-def _messages(data, final, in_gap, table):  # pragma: no cover  (compiled)
-    """Find the whole messages of a chunk.
+def _messages(data, final, in_gap, table, shifts):  # pragma: no cover  (compiled)
+    """Find the whole messages of a chunk, in a time that grows with its length, whatever the bytes claim.
 
     Returns their offsets, the number of bytes processed, the number of stretches of bad bytes that begin in it, the
     number of bytes skipped, and whether the chunk ends inside such a stretch.
     """
     n = len(data)
+    before = np.empty(n + 1, np.uint16)  # the CRC of all bytes before each
+    crc = np.uint16(0)
+    for i in range(n):
+        before[i] = crc
+        crc = np.uint16((crc >> 8) ^ table[(crc ^ data[i]) & 0xFF])
+    before[n] = crc
     offsets = np.empty(n // 22 + 1, np.int64)
     found, at, gaps, skipped = 0, 0, 0, 0
     while at + 22 <= n:
@@ -293,10 +346,13 @@ def _messages(data, final, in_gap, table):  # pragma: no cover  (compiled)
             if end > n and not final:
                 break
             if end <= n:
-                crc = np.uint16(0)
-                for i in range(at, end - 2):
-                    crc = np.uint16((crc >> 8) ^ table[(crc ^ data[i]) & 0xFF])
-                if crc == np.uint16(data[end - 2] | np.int64(data[end - 1]) << 8):
+                crc, length, k = before[at], end - 2 - at, 0
+                while length:
+                    if length & 1:
+                        crc = np.uint16(shifts[k, 0, crc & 0xFF] ^ shifts[k, 1, crc >> 8])
+                    length >>= 1
+                    k += 1
+                if crc ^ before[end - 2] == np.uint16(data[end - 2] | np.int64(data[end - 1]) << 8):
                     offsets[found] = at
                     found += 1
                     at = end

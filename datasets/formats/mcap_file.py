@@ -11,8 +11,10 @@ import struct
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +23,20 @@ from ..errors import DatasetError, one_line
 from .recording import extra, not_found
 from .ros_messages import Definitions, Types, definitions_of, ros_channel, short_name
 from .topics import NS, Channel, MalformedMessage, Message, ScanResult, ShortArray, TopicRecording
+from .unpacking import Unpacking
 
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE = 3, 4, 5
-"""Opcodes of the records in a chunk (MCAP specification, "Records")."""
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, STATISTICS = 2, 3, 4, 5, 6, 11
+"""Opcodes of the records that are read (MCAP specification, "Records"); 0 is none."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQII")
+"""Of a chunk: times of its first and last message, its size and checksum unpacked, and the length of what follows."""
+_LENGTH = struct.Struct("<Q")
+MOST_TYPES = 10_000
+"""Types in a schema of Protocol Buffers; each makes a class of Python of some 3 kB."""
+MOST_FIELDS, MOST_LEVELS = 10_000, 50
+"""Of a type of Protocol Buffers or an object of JSON that are listed, and how deep in one another, as for ROS."""
 _TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
 
@@ -55,13 +65,7 @@ def mcap_messages(
     Raises:
         DatasetError: not an MCAP file, or it contains no whole message.
     """
-    with extra("mcap"):
-        from mcap.records import Chunk, Footer
-        from mcap.records import Message as Record
-        from mcap.stream_reader import StreamReader, get_chunk_data_stream
     path = plain if path is None else path
-    reading = _Reading(path, types, topics, found)
-    finished, damaged = False, 0
     try:
         stream = plain.open("rb")
     except OSError as error:
@@ -71,37 +75,22 @@ def mcap_messages(
         if magic != MAGIC:
             what = f"it begins with {magic!r}" if magic else "an empty file"
             raise DatasetError(f"{path}: not an MCAP file: {what}")
-        size = plain.stat().st_size
-        records = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=size).records
-        why = "the end of the file"
-        while True:
-            try:
-                record = next(records, None)
-            except Exception as error:  # the reader's many ways to fail
-                why = " ".join(f"{type(error).__name__} {error}".split())
+        at, size, opcode = len(MAGIC), plain.stat().st_size, -1
+        reading = _Reading(path, types, topics, found, size)
+        while at + _RECORD.size <= size and opcode != FOOTER:
+            opcode, length = _RECORD.unpack(stream.read(_RECORD.size))
+            start, at = at + _RECORD.size, at + _RECORD.size + length
+            if opcode == 0 or (at > size and opcode != CHUNK):
                 break
-            if record is None:
-                break
-            if isinstance(record, Chunk):
-                try:
-                    data_stream, length = get_chunk_data_stream(record, validate_crc=True)
-                    data = data_stream.read(length)
-                except Exception:  # the decompressors' many ways to fail
-                    damaged += 1
-                    continue
-                yield from reading.chunk(data)
-            elif isinstance(record, Record):
-                yield from reading.message(record.channel_id, record.log_time, record.publish_time, record.data)
-            elif isinstance(record, Footer):
-                finished = True
-                break
-            else:
-                reading.define(record)
-    damaged += reading.damaged
-    if not finished:
-        found.notes.append(f"{path.name}: damaged, or cut off: nothing is read from there on ({why})")
-    if damaged:
-        found.notes.append(f"{path.name}: {damaged} damaged chunks or records skipped")
+            if opcode == CHUNK:
+                yield from reading.packed(stream.read(min(length, size - start)), whole=at <= size)
+            elif opcode in (SCHEMA, CHANNEL, MESSAGE, STATISTICS):
+                yield from reading.records(opcode, stream.read(length))
+            stream.seek(min(at, size))
+    if opcode != FOOTER:
+        found.notes.append(f"{path.name}: damaged, or cut off: nothing is read from there on (of {size} bytes)")
+    if reading.damaged:
+        found.notes.append(f"{path.name}: {reading.damaged} damaged chunks or records skipped")
     if not reading.whole:
         notes = "; ".join(["", *found.notes])
         raise DatasetError(f"{path}: contains no whole message{notes}")
@@ -110,41 +99,65 @@ def mcap_messages(
 class _Reading:
     """The schemas and channels of a file, while its records are read."""
 
-    def __init__(self, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult) -> None:
+    def __init__(self, path: Path, types: Types, topics: Collection[str] | None, found: ScanResult, size: int) -> None:
+        with extra("mcap"):
+            import mcap.records
+            from mcap.data_stream import ReadDataStream
+        self.of_mcap: Any = mcap.records
+        self.stream = ReadDataStream
         self.path, self.types, self.topics, self.found = path, types, topics, found
+        self.unpacking = Unpacking(str(path), size, "mcap")
         self.schemas: dict[int, Any] = {}
         self.channels: dict[int, Channel] = {}
         self.wanted: set[int] = set()
         self.whole = self.damaged = 0
 
-    def chunk(self, data: bytes) -> Iterator[Message]:
-        """Yield the wanted messages of a chunk, up to where it is damaged."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Channel as ChannelRecord
-        from mcap.records import Schema
-
+    def packed(self, chunk: bytes, *, whole: bool) -> Iterator[Message]:
+        """Yield the wanted messages of a chunk; of one that is not whole, those that are there."""
+        try:
+            _, _, size, checksum, length = _CHUNK.unpack_from(chunk)
+            at = _CHUNK.size + length
+            compression = chunk[_CHUNK.size : at].decode()
+            data = chunk[at + _LENGTH.size :][: _LENGTH.unpack_from(chunk, at)[0]]
+            data = self.unpacking.unpacked(compression, data, whole=whole)
+            if whole and (crc32(data) != checksum if checksum else len(data) != size):
+                raise ValueError("not what was packed")
+        except DatasetError:
+            raise
+        except Exception:  # the decompressors' many ways to fail
+            self.damaged += whole
+            return
         at = 0
         while at < len(data):
+            if at + _RECORD.size > len(data):
+                self.damaged += whole
+                return
+            opcode, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            if opcode == 0 or at + length > len(data):
+                self.damaged += whole
+                return
+            yield from self.records(opcode, data, at, length)
+            at += length
+
+    def records(self, opcode: int, data: bytes, at: int = 0, length: int | None = None) -> Iterator[Message]:
+        """Yield the message of a record, if it is one of a wanted topic; register what else it says."""
+        length = len(data) if length is None else length
+        if opcode == MESSAGE and length >= _MESSAGE.size:
+            number, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
+            body = data[at + _MESSAGE.size : at + length] if number in self.wanted else b""
+            yield from self.message(number, log_ns, publish_ns, body)
+        elif opcode == MESSAGE:
+            self.damaged += 1
+        elif opcode in (SCHEMA, CHANNEL, STATISTICS):
+            kinds = {SCHEMA: "Schema", CHANNEL: "Channel", STATISTICS: "Statistics"}
             try:
-                opcode, length = _RECORD.unpack_from(data, at)
-                at += _RECORD.size
-                if at + length > len(data):
-                    raise ValueError("beyond the chunk")
-                if opcode == MESSAGE:
-                    number, _, log_ns, publish_ns = _MESSAGE.unpack_from(data, at)
-                    if length < _MESSAGE.size:
-                        raise ValueError("too short for a message")
-                    body = data[at + _MESSAGE.size : at + length] if number in self.wanted else b""
-                    yield from self.message(number, log_ns, publish_ns, body)
-                elif opcode in (SCHEMA, CHANNEL):
-                    kind = Schema if opcode == SCHEMA else ChannelRecord
-                    self.define(kind.read(ReadDataStream(BytesIO(data[at : at + length]))))
+                record = getattr(self.of_mcap, kinds[opcode]).read(self.stream(BytesIO(data[at : at + length])))
+                self.define(record)
             except DatasetError:
                 raise
             except Exception:  # the reader's many ways to fail
                 self.damaged += 1
-                return
-            at += length
 
     def message(self, number: int, log_ns: int, publish_ns: int, data: bytes) -> Iterator[Message]:
         """Yield a message, if it is of a wanted topic."""
@@ -157,18 +170,21 @@ class _Reading:
             yield channel, (log_ns, publish_ns), data
 
     def define(self, record: Any) -> None:
-        """Register a schema or a channel."""
-        from mcap.records import Channel as ChannelRecord
-        from mcap.records import Schema
-
-        if isinstance(record, Schema):
-            self.schemas.setdefault(record.id, record)
-        elif isinstance(record, ChannelRecord) and record.id not in self.channels:
+        """Register a schema or a channel, or what the statistics count."""
+        if isinstance(record, self.of_mcap.Schema):
+            if record.id not in self.schemas:
+                self.found.keep(len(record.data), self.path)
+                self.schemas[record.id] = record
+        elif isinstance(record, self.of_mcap.Statistics):
+            for number, count in record.channel_message_counts.items():
+                if number in self.channels:
+                    self.found.count("the summary", self.channels[number].topic, count)
+        elif record.id not in self.channels:
             channel = _channel(record, self.schemas.get(record.schema_id), self.types, self.path)
             self.channels[record.id] = channel
             if self.topics is not None and channel.topic in self.topics:
                 self.wanted.add(record.id)
-            self.found.channels.append(channel)
+            self.found.add(channel, 0)
 
 
 def _channel(record: Any, schema: Any, types: Types, path: Path) -> Channel:
@@ -204,8 +220,11 @@ def _protobuf_channel(topic: str, kind: str, schema: Any, where: str) -> Channel
     @cache
     def decoder() -> Callable[[bytes], Any]:
         with extra("mcap"):
+            from google.protobuf.descriptor_pb2 import FileDescriptorSet
             from mcap_protobuf.decoder import DecoderFactory
         try:
+            if schema is not None:
+                _refuse_many_types(FileDescriptorSet.FromString(schema.data))
             decode = DecoderFactory().decoder_for("protobuf", schema)
             if decode is None:
                 raise ValueError(f"its schema is {None if schema is None else schema.encoding!r}")
@@ -216,24 +235,44 @@ def _protobuf_channel(topic: str, kind: str, schema: Any, where: str) -> Channel
         return decode
 
     def fields() -> tuple[str, ...]:
-        return tuple(_protobuf_fields(decoder()(b"").DESCRIPTOR, "", ()))
+        return tuple(_protobuf_fields(decoder()(b"").DESCRIPTOR))
 
     return Channel(topic, kind, fields, lambda wanted: ProtobufExtractor(decoder(), wanted, where))
 
 
-def _protobuf_fields(descriptor: Any, prefix: str, above: tuple[str, ...]) -> Iterator[str]:
-    """Yield the paths of a type's numeric fields; for a repeated field, that of its first element."""
-    if descriptor.full_name in above:
-        return  # a type may contain itself: it is listed once
-    for field in descriptor.fields:
-        path = f"{prefix}{field.name}.0" if _repeated(field) else prefix + field.name
-        if field.message_type is None:
-            if _code(field) is not None:
+def _refuse_many_types(files: Any) -> None:
+    found = [kind for file in files.file for kind in file.message_type]
+    for kind in found:  # grows meanwhile
+        found += kind.nested_type
+        if len(found) > MOST_TYPES:
+            raise ValueError(f"it has more than {MOST_TYPES} types")
+
+
+def _protobuf_fields(descriptor: Any) -> Iterator[str]:
+    """Yield the paths of a type's numeric fields, at most MOST_FIELDS; for a repeated field, that of its first element.
+
+    A type may contain itself: it is listed once.
+    """
+    left = MOST_FIELDS
+
+    def walk(descriptor: Any, prefix: str, above: tuple[str, ...]) -> Iterator[str]:
+        nonlocal left
+        if descriptor.full_name in above or len(above) > MOST_LEVELS:
+            return
+        for field in descriptor.fields:
+            left -= 1
+            if left < 0:
+                return
+            path = f"{prefix}{field.name}.0" if _repeated(field) else prefix + field.name
+            if field.message_type is None:
+                if _code(field) is not None:
+                    yield path
+            elif field.message_type.full_name in _TIMES:
                 yield path
-        elif field.message_type.full_name in _TIMES:
-            yield path
-        elif not field.message_type.GetOptions().map_entry:
-            yield from _protobuf_fields(field.message_type, f"{path}.", (*above, descriptor.full_name))
+            elif not field.message_type.GetOptions().map_entry:
+                yield from walk(field.message_type, f"{path}.", (*above, descriptor.full_name))
+
+    yield from walk(descriptor, "", ())
 
 
 def _repeated(field: Any) -> bool:
@@ -268,7 +307,7 @@ class ProtobufExtractor:
         for column in wanted:
             steps, code = _protobuf_path(descriptor, column)
             if code is None:
-                known = _protobuf_fields(descriptor, "", ())
+                known = _protobuf_fields(descriptor)
                 raise not_found(where, f"numeric field of {descriptor.full_name} called", column, known)
             self._paths.append((column, steps, code))
             self.codes.append("q" if code == "time" else code)
@@ -362,7 +401,12 @@ class JsonExtractor:
         """
         for column in self._wanted:
             if column not in self._met:
-                raise not_found(self._where, "numeric field called", column, _json_fields(self._shape or {}, ""))
+                raise not_found(
+                    self._where,
+                    "numeric field called",
+                    column,
+                    islice(_json_fields(self._shape or {}, "", 0), MOST_FIELDS),
+                )
         return dict(zip(self._wanted, raw, strict=True))
 
     def _value(self, message: Any, column: str, path: Sequence[str]) -> int | float:
@@ -396,10 +440,10 @@ def _json_number(value: Any) -> int | float | None:
     return None
 
 
-def _json_fields(value: Any, prefix: str) -> Iterator[str]:
+def _json_fields(value: Any, prefix: str, level: int) -> Iterator[str]:
     items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
     for name, inner in items:
         if _json_number(inner) is not None:
             yield f"{prefix}{name}"
-        else:
-            yield from _json_fields(inner, f"{prefix}{name}.")
+        elif level < MOST_LEVELS:
+            yield from _json_fields(inner, f"{prefix}{name}.", level + 1)

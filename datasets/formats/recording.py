@@ -48,7 +48,12 @@ class Wanted:
 
 @dataclass(frozen=True)
 class TopicInfo:
-    """A kind of message in a recording: name, type, number of messages, time from first to last (s), and fields."""
+    """A kind of message in a recording: name, type, number of messages, time from first to last (s), and fields.
+
+    Attributes:
+        sender: which of several senders of this name; None for one.
+        missing: messages that the recording counts and does not contain.
+    """
 
     message: str
     kind: str
@@ -56,6 +61,7 @@ class TopicInfo:
     span_s: float
     fields: tuple[str, ...]
     sender: int | None = None
+    missing: int = 0
 
 
 @dataclass(frozen=True)

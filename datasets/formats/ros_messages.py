@@ -24,12 +24,22 @@ CODES = {"bool": "B", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int1
 TIMES = {"time", "duration", "builtin_interfaces/Time", "builtin_interfaces/Duration"}
 """Seconds and nanoseconds, read as one number of nanoseconds."""
 STRINGS = {"string", "wstring"}
-MOST_FIELDS = 100_000
-"""More than any real message has; a damaged definition may have more."""
+MOST_FIELDS = 10_000
+"""Of one type with all that it contains; large ones have some hundred. Few lines can contain one another often."""
+MOST_LEVELS = 50
+"""Types in one another; the deepest of ROS has 6."""
+LONGEST_PATH = 1000
+"""Characters of a field's path."""
+MOST_DEFINITION = 1 << 20
+"""Characters of the definition of a type with all that it contains: 1 MiB; large ones have some 30 kB."""
+MOST_IDL = 100_000
+"""Characters of a definition in IDL, whose parser takes 0.1 ms for each; nav_msgs/Odometry has 20,000."""
 
 _LINE = re.compile(
-    r"(?P<base>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<most><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)"
+    r"(?P<base>[A-Za-z][\w/]*)(?:<=\d+)?(?P<array>\[(?P<most><=)?(?P<count>\d{0,9})\])?\s+(?P<name>[A-Za-z]\w*)"
 )
+_IDL_ASIDE = re.compile(r'"(?:[^"\\]|\\.)*"|//[^\n]*|/\*(?:.*?\*/|.*)|@[\w:]+\s*\(', re.DOTALL)
+"""Parts of IDL that may hold an opening parenthesis: text, comments, annotations."""
 
 
 class Field(NamedTuple):
@@ -72,13 +82,17 @@ def parse_definitions(text: str, kind: str, where: str) -> dict[str, Definition]
     """Return the definitions in a text by their short names; `kind` is the name of the first one.
 
     Raises:
-        DatasetError: a line is not part of a definition.
+        DatasetError: a line is not part of a definition, or a type has two fields of one name.
     """
+    if len(text) > MOST_DEFINITION:
+        raise DatasetError(f"{where}: {kind}: a definition of more than {MOST_DEFINITION} characters")
     types: dict[str, Definition] = {}
     name, fields = short_name(kind), []
     for line in [*text.splitlines(), "==="]:
         line = line.strip()
         if line.startswith("==="):
+            if len({field.name for field in fields}) < len(fields):
+                raise DatasetError(f"{where}: {name}: two fields of one name")
             types.setdefault(name, tuple(fields))
             fields = []
         elif line.startswith("MSG:"):
@@ -116,6 +130,11 @@ def definitions_of(text: str, encoding: str, kind: str, where: str) -> dict[str,
         return parse_definitions(text, kind, where)
     if encoding not in ("ros2idl", "omgidl"):
         raise DatasetError(f"{where}: {kind} is defined in {encoding!r}, which is not supported")
+    if len(text) > MOST_IDL:
+        raise DatasetError(f"{where}: {kind}: a definition of more than {MOST_IDL} characters of IDL")
+    if "(" in _IDL_ASIDE.sub(" ", text):
+        what = "an expression in parentheses, which takes the parser for ever"
+        raise DatasetError(f"{where}: the definition of {kind} has {what}; name its .msg file in `definitions`")
     with extra("ros"):
         from rosbags.typesys import Stores, get_types_from_idl, get_typestore
     try:
@@ -137,12 +156,11 @@ def numeric_fields(types: Types, kind: str, where: str) -> tuple[str, ...]:
         DatasetError: a type is not defined.
     """
     found: list[str] = []
+    bounds = _Bounds(types, where)
 
     def walk(kind: str, prefix: str, above: tuple[str, ...]) -> None:
-        for name, base, count in _definition(types, kind, above, where):
+        for name, base, count in bounds.definition(kind, prefix, above):
             path = f"{prefix}{name}" if count is None else f"{prefix}{name}.0"
-            if len(found) > MOST_FIELDS:
-                raise DatasetError(f"{where}: {kind}: more than {MOST_FIELDS} fields")
             if base in CODES or base in TIMES:
                 found.append(path)
             elif base not in STRINGS:
@@ -152,13 +170,33 @@ def numeric_fields(types: Types, kind: str, where: str) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _definition(types: Types, kind: str, above: tuple[str, ...], where: str) -> Definition:
-    if kind in above:
-        raise DatasetError(f"{where}: the type {kind} contains itself")
-    try:
-        return types[kind]
-    except KeyError:
-        raise DatasetError(f"{where}: no definition of the type {kind}; name its .msg file in `definitions`") from None
+class _Bounds:
+    """Looks types up for one walk through a type, and ends a walk that would take too long."""
+
+    def __init__(self, types: Types, where: str) -> None:
+        self.types, self.where, self.seen = types, where, 0
+
+    def definition(self, kind: str, prefix: str, above: tuple[str, ...]) -> Definition:
+        """Return the definition of a type, met at the path `prefix` inside the types `above`.
+
+        Raises:
+            DatasetError: it is not defined or contains itself, or all of it is too large.
+        """
+        if kind in above:
+            raise DatasetError(f"{self.where}: the type {kind} contains itself")
+        try:
+            definition = self.types[kind]
+        except KeyError:
+            raise DatasetError(
+                f"{self.where}: no definition of the type {kind}; name its .msg file in `definitions`"
+            ) from None
+        self.seen += 1 + len(definition)
+        if self.seen > MOST_FIELDS or len(above) > MOST_LEVELS or len(prefix) > LONGEST_PATH:
+            limits = f"{MOST_FIELDS} fields, {MOST_LEVELS} types in one another, or {LONGEST_PATH} characters of a path"
+            raise DatasetError(
+                f"{self.where}: the type {(*above, kind)[0]} has more than {limits}; that is no recording's"
+            )
+        return definition
 
 
 class _Leaf(NamedTuple):
@@ -238,12 +276,12 @@ class _Plan:
     """Turns a type's definition into the steps that read it, in one byte order."""
 
     def __init__(self, types: Types, wanted: Sequence[str], serialisation: Serialisation, order: str, where: str):
-        self.types, self.wanted, self.order, self.where = types, wanted, order, where
+        self.wanted, self.order, self.where = frozenset(wanted), order, where
         self.serialisation: Serialisation = serialisation
         self.cdr = serialisation == "cdr"
         self.length = struct.Struct(order + "I")
         self.leaves: dict[str, _Leaf] = {}
-        self.seen = 0
+        self.bounds = _Bounds(types, where)
 
     def message(self, kind: str) -> Step:
         """Return the step over a message of this type."""
@@ -255,10 +293,7 @@ class _Plan:
         self, kind: str, prefix: str, above: tuple[str, ...], steps: list[Step], run: list[tuple[str, int, int]]
     ) -> list[tuple[str, int, int]]:
         """Append the steps over a type's fields; return the run of fixed fields (codes, size, alignment) left open."""
-        definition = _definition(self.types, kind, above, self.where)
-        self.seen += len(definition)
-        if self.seen > MOST_FIELDS:
-            raise DatasetError(f"{self.where}: {kind}: more than {MOST_FIELDS} fields")
+        definition = self.bounds.definition(kind, prefix, above)
         if not definition and self.cdr:
             run.append(("x", 1, 1))  # an empty message is a byte in CDR
         for name, base, count in definition:
@@ -397,7 +432,9 @@ class _Plan:
             if elements < least:
                 raise ShortArray(path, elements)
             for index in range(elements):
-                at = picks.get(index, skip)(data, at, out)
+                start, at = at, picks.get(index, skip)(data, at, out)
+                if at == start and index >= least:  # elements without a byte, of which there may be any number
+                    break
             return at
 
         return step

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +17,20 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DatasetError
+from ..errors import DatasetError, shown
 from ..state import TimeArray
 from .recording import Messages, Recording, TopicInfo, Wanted, not_found
 
 NS = 1_000_000_000
 """Nanoseconds per second."""
+MOST_CHANNELS = 10_000
+"""In a recording; a busy vehicle has some hundred topics."""
+MOST_DEFINITIONS = 64 << 20
+"""Bytes of all definitions of messages in a recording: 64 MiB; that of one type has some 10 kB."""
+MOST_FIELDS_LISTED = 100_000
+"""In the contents of a recording; a message has some 50."""
+LEAST_COST = 100
+"""Fields that listing a topic counts as at least, for types that are refused after a long look."""
 
 
 class MalformedMessage(Exception):  # noqa: N818  (about one message; reading goes on)
@@ -82,6 +91,30 @@ class ScanResult:
 
     channels: list[Channel] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+    """Who counted the messages of the topics (an index, metadata), and how many."""
+    _kept: int = 0
+
+    def add(self, channel: Channel, definition: int) -> None:
+        """Add a channel, of which a definition of so many bytes is kept."""
+        if len(self.channels) >= MOST_CHANNELS:
+            raise DatasetError(f"{channel.topic}: more than {MOST_CHANNELS} topics, which no recorder writes")
+        self.keep(definition, channel.topic)
+        self.channels.append(channel)
+
+    def keep(self, definition: int, where: object) -> None:
+        """Count the bytes of definitions that are kept."""
+        self._kept += definition
+        if self._kept > MOST_DEFINITIONS:
+            raise DatasetError(f"{where}: definitions of messages of more than {MOST_DEFINITIONS >> 20} MiB in all")
+
+    def count(self, source: str, topic: str, messages: int) -> None:
+        """Add to what a source counts of a topic."""
+        self.counts.setdefault(source, Counter())[topic] += messages
+
+    def missing(self, topic: str, read: int) -> tuple[int, str]:
+        """Return how many messages more a source counts than are read, the most of any, and who; 0 if none does."""
+        return max(((counts[topic] - read, source) for source, counts in self.counts.items()), default=(0, ""))
 
 
 class Rows:
@@ -100,7 +133,8 @@ class Rows:
         try:
             self._bytes += self._struct.pack(*values)
         except struct.error:
-            self._widen(values)
+            if not self._widened(values):  # a number that no float64 can hold
+                raise
             self._bytes += self._struct.pack(*values)
 
     def arrays(self) -> list[NDArray[Any]]:
@@ -111,13 +145,18 @@ class Rows:
     def _dtype(self) -> np.dtype[Any]:
         return np.dtype([(f"c{i}", "<" + code) for i, code in enumerate(self._codes)])
 
-    def _widen(self, values: Sequence[Any]) -> None:
+    def _widened(self, values: Sequence[Any]) -> bool:
+        """Make floats of the integer columns in which a value is none; return whether there was such a column."""
+        whole = [isinstance(value, int) and -(2**63) <= value < 2**63 for value in values]
+        codes = [
+            "d" if code == "q" and not is_whole else code for code, is_whole in zip(self._codes, whole, strict=True)
+        ]
+        if codes == self._codes:
+            return False
         before = np.frombuffer(bytes(self._bytes), self._dtype())
-        for i, value in enumerate(values):
-            if self._codes[i] == "q" and not (isinstance(value, int) and -(2**63) <= value < 2**63):
-                self._codes[i] = "d"
-        self._struct = struct.Struct("<" + "".join(self._codes))
+        self._codes, self._struct = codes, struct.Struct("<" + "".join(codes))
         self._bytes = bytearray(before.astype(self._dtype()).tobytes())
+        return True
 
 
 class TopicRecording(Recording):
@@ -146,13 +185,19 @@ class TopicRecording(Recording):
             tables[channel.topic].add(channel, stamps, data)
         notes = list(found.notes)
         for name, table in tables.items():
+            missing, source = found.missing(name, table.count)
             if not table.channels:
                 known = {channel.topic for channel in found.channels}
                 if name in known:
-                    raise DatasetError(f"{where}: no message of {name} in the recording")
+                    counted = [f"{source} counts {missing}"] if missing > 0 else []
+                    raise DatasetError("; ".join([f"{where}: no message of {name} in the recording", *counted, *notes]))
                 raise not_found(where, "topic", name, known)
+            if missing > 0:
+                notes.append(
+                    f"{name}: {missing} of the {missing + table.count} messages that {source} counts are missing"
+                )
             notes += table.notes()
-        return Messages([tables[want.message].columns() for want in wanted], tuple(notes))
+        return Messages([tables[want.message].columns() for want in wanted], tuple(map(shown, notes)))
 
     def contents(self, folder: Path) -> list[TopicInfo]:
         """Return the topics of the recording."""
@@ -161,10 +206,16 @@ class TopicRecording(Recording):
         for channel, stamps, _ in self.messages(folder, None, found):
             _, count, first, last = spans.get(channel.topic, (channel, 0, stamps[0], stamps[0]))
             spans[channel.topic] = channel, count + 1, min(first, stamps[0]), max(last, stamps[0])
-        return [
-            TopicInfo(topic, channel.kind, count, (last - first) / NS, _fields(channel))
-            for topic, (channel, count, first, last) in sorted(spans.items())
-        ]
+        infos, left = [], MOST_FIELDS_LISTED
+        for topic, (channel, count, first, last) in spans.items():
+            fields = _fields(channel) if left > 0 else ()
+            left -= max(len(fields), LEAST_COST)
+            missing, _ = found.missing(topic, count)
+            infos.append(TopicInfo(topic, channel.kind, count, (last - first) / NS, fields, missing=max(missing, 0)))
+        lost = {channel.topic: channel.kind for channel in found.channels if channel.topic not in spans}
+        counted = {topic: found.missing(topic, 0)[0] for topic in lost}
+        infos += [TopicInfo(topic, lost[topic], 0, 0.0, (), missing=n) for topic, n in counted.items() if n > 0]
+        return sorted(infos, key=lambda info: info.message)
 
 
 def _fields(channel: Channel) -> tuple[str, ...]:
@@ -184,6 +235,11 @@ class _Table:
         self.channels: dict[Channel, Extractor] = {}
         self.rows: Rows | None = None
         self.malformed, self.first_malformed = 0, ""
+
+    @property
+    def count(self) -> int:
+        """Messages so far, damaged ones included."""
+        return self.malformed + (0 if self.rows is None else len(self.rows))
 
     def add(self, channel: Channel, stamps: tuple[int, ...], data: bytes) -> None:
         extract = self.channels.get(channel) or self._opened(channel)

@@ -91,6 +91,15 @@ def test_a_value_is_readable_in_a_label(value: Any, words: str) -> None:
     assert points(named_axes({"x": [value]})) == [(words, {"x": value})]
 
 
+def test_more_runs_than_anybody_waits_for_are_refused() -> None:
+    grid = {"speed_m_s": [1 + i / 100 for i in range(11)]}
+    refused(
+        ["11 logs · 100000 seeds · 1 estimators = 1100000 runs"],
+        seeds=100_000,
+        logs=[{"scenario": SHORT, "grid": grid}],
+    )
+
+
 def test_every_point_of_a_grid_has_its_own_drops() -> None:
     plan = experiment(
         estimators=[{"name": "fls", "grid": {"lag_s": [1, 3]}, "drop": ["gps"], "baseline": "fls lag_s=1"}]
@@ -140,6 +149,8 @@ def test_variants_survive_being_written_out_again() -> None:
         ({"grid": {"max_delay_s": 3}}, ["estimators[0].grid", "max_delay_s: expected a list", "found 3"]),
         ({"grid": {"max_delay_s": []}}, ["max_delay_s: expected a list"]),
         ({"grid": ["max_delay_s"]}, ["estimators[0].grid", "expected a mapping"]),
+        ({"grid": {f"k{i}": list(range(10)) for i in range(12)}}, ["= 1000000000000 points are more than 10000"]),
+        ({"grid": {"robust": ["x" * 501]}}, ["robust: a value of more than 500 characters", "{name: value}"]),
         ({"baseline": "esfk"}, ["baseline", "no estimator has the label 'esfk'", "did you mean 'eskf'"]),
         ({"dorp": ["dvl"]}, ["estimators[0].dorp", "did you mean 'drop'"]),
     ],

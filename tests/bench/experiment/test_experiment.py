@@ -233,7 +233,7 @@ def test_one_mistake_is_one_complaint() -> None:
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("a: [", "not readable as YAML"), ("- 1", "expected keys"), ("", "expected keys"), ("logs: []", "estimators")],
+    [("a: [", "not YAML: did not find"), ("- 1", "expected keys"), ("", "expected keys"), ("logs: []", "estimators")],
 )
 def test_a_broken_file_is_named(tmp_path: Path, text: str, says: str) -> None:
     file = tmp_path / "e.yaml"

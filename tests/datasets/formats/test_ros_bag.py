@@ -381,6 +381,9 @@ def test_what_is_not_wanted_costs_no_memory(tmp_path, version):
     assert peak() < 4 * wanted + 4_000_000  # a few chunks of the file, of which each holds an image
 
 
+DAMAGED = ["ros1", "ros1-bz2", "sqlite", "metadata", "packed", "packed-messages", "journal"]
+
+
 @pytest.fixture(scope="session")
 def fuzzed(small, ros1, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fuzzed")
@@ -388,12 +391,21 @@ def fuzzed(small, ros1, tmp_path_factory):
     bags["ros1-bz2"] = (write_ros1(small, folder / "bz2", "bz2"), "log.bag")
     bags["sqlite"] = (write_ros2(small, folder / "sqlite"), "bag/bag.db3")
     bags["metadata"] = (write_ros2(small, folder / "metadata", "mcap"), "bag/metadata.yaml")
+    bags["packed"] = (write_ros2(small, folder / "packed", "sqlite3", "file"), "bag/bag.db3.zstd")
+    bags["packed-messages"] = (write_ros2(small, folder / "packed-messages", "sqlite3", "message"), "bag/bag.db3")
+    write_ros2(small, folder / "closed")
+    with sqlite3.connect(folder / "closed" / "bag" / "bag.db3") as database:
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("UPDATE messages SET timestamp = timestamp + 1")
+        database.commit()
+        bags["journal"] = (copied(folder / "closed", folder / "journal"), "bag/bag.db3-wal")
+    database.close()
     return {name: (folder, folder / file, (folder / file).read_bytes()) for name, (folder, file) in bags.items()}
 
 
 @pytest.mark.slow
 @settings(max_examples=80, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**32), which=st.sampled_from(["ros1", "ros1-bz2", "sqlite", "metadata"]))
+@given(seed=st.integers(0, 2**32), which=st.sampled_from(DAMAGED))
 def test_a_damaged_bag_gives_a_log_or_an_error(fuzzed, seed, which):
     folder, file, data = fuzzed[which]
     file.write_bytes(damaged(data, seed))
