@@ -173,6 +173,7 @@ class Log:
         prior: belief at the start, if the log states one (simulated logs do); else `initialise` makes it.
         notes: what was repaired, converted, counted or fitted on reading, one sentence each.
         origin: (latitude °, longitude °) of W's origin, if the log is geodetic.
+        max_wait_s: how long the start may wait for its sensors, s; None: as long as `initialise` does by default.
     """
 
     name: str
@@ -187,6 +188,7 @@ class Log:
     prior: Belief | None = None
     notes: tuple[str, ...] = ()
     origin: tuple[float, float] | None = None
+    max_wait_s: float | None = None
 
     @property
     def streams(self) -> dict[str, ReadingStream]:

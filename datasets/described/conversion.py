@@ -1,9 +1,9 @@
 """From a description and a folder to a Log: rows are read, checked, and converted to our frames and units.
 
-The steps are the same for every stream. Rows declared invalid are dropped. Rows with numbers that are not finite are an
-error, or dropped with `repair`. Declared outliers are dropped. Times out of order are an error, or dropped with
-`repair`. Every n-th row is kept. `Log.notes` counts all that was dropped. A truth or a stream that does not overlap
-the IMU's time is an error: some clock is wrong.
+The steps are the same for every stream. Rows declared invalid or outside the window are dropped. Rows with numbers
+that are not finite are an error, or dropped with `repair`. Declared outliers are dropped. Times out of order are an
+error, or dropped with `repair`. Every n-th row is kept. `Log.notes` counts all that was dropped. A truth or a stream
+that does not overlap the IMU's time is an error: some clock is wrong.
 """
 
 from __future__ import annotations
@@ -43,12 +43,13 @@ DEVICE = "device"
 
 @dataclass
 class _Opening:
-    """The state of opening one folder: description, strictness, notes and messages so far."""
+    """The state of opening one folder: description, strictness, notes, the IMU's time, and messages so far."""
 
     description: d.Description
     folder: Path
     repair: bool
     notes: list[str] = field(default_factory=list)
+    imu_ns: tuple[int, int] | None = None
     messages: dict[tuple[str, int | None], Mapping[str, NDArray[Any]]] | None = None
 
     def columns(self, part: d.SourceDescription | d.TruthDescription, wanted: Iterable[d.Column]) -> Columns:
@@ -58,6 +59,35 @@ class _Opening:
             return read_table(self.folder, part.table, [c for c in wanted if c not in times], times)
         assert part.message is not None
         return self._joined(part.message, list(wanted))
+
+    def window(self, stream: str, part: d.Window, t_ns: TimeArray) -> Mask:
+        """Return which rows of a stream or of the truth are in the window; the IMU's rows, read first, set its zero.
+
+        Raises:
+            DatasetError: the stream lies wholly outside the IMU's time, so that some clock is wrong.
+        """
+        inside = np.ones(len(t_ns), bool)
+        if not len(t_ns):
+            return inside
+        span_ns = int(t_ns.min()), int(t_ns.max())
+        self.imu_ns = self.imu_ns or span_ns
+        window = self.description.window(part)
+        if not window.from_s and window.until_s is None:
+            return inside
+        start_ns = self.imu_ns[0]
+        if span_ns[1] < start_ns or span_ns[0] > self.imu_ns[1]:
+            raise DatasetError(f"{self.folder}: {_wrong_clock(stream, span_ns, self.imu_ns)}")
+        inside &= t_ns >= start_ns + round(window.from_s * 1e9) if window.from_s else True
+        inside &= t_ns < start_ns + round(window.until_s * 1e9) if window.until_s is not None else True
+        end = "" if window.until_s is None else f" until {window.until_s:g} s"
+        left_out = (
+            f"{np.count_nonzero(~inside)} of {len(t_ns)} rows are outside the window from {window.from_s:g} s{end}"
+        )
+        if stream == "imu" and np.count_nonzero(inside) < 2:
+            raise DatasetError(f"{self.folder}: imu: {left_out}; change `from_s` or `until_s`")
+        if not inside.all():
+            self.notes.append(f"{stream}: {left_out} and left out")
+        return inside
 
     def _joined(self, message: d.Message, wanted: list[d.Column]) -> Columns:
         """Return columns of messages; `device` is their own clock, mapped to the host's."""
@@ -215,6 +245,8 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
+        if truth_rows is None:
+            truth = truth.select(opening.window("truth", truth_part, truth.t_ns))
 
     with _named(folder):
         mountings = {
@@ -245,6 +277,7 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
         prior=None if description.prior is None else description.prior.belief(),
         notes=(*description.notes, *opening.notes),
         origin=degrees,
+        max_wait_s=description.max_wait_s,
     )
     with _named(folder):
         _check_clocks(log)
@@ -262,9 +295,17 @@ def _check_clocks(log: Log) -> None:
     for name, part in {**log.streams, "truth": log.truth}.items():
         if part is not None and len(part) and (part.t_ns[-1] < start_ns or part.t_ns[0] > end_ns):
             raise DatasetError(
-                f"{name}: {part.t_ns[0] * 1e-9:.3f} s to {part.t_ns[-1] * 1e-9:.3f} s lies wholly outside {imu}; "
-                "check its clock (`clock_offset_s`) and the `unit` of its time"
+                _wrong_clock(name, (int(part.t_ns[0]), int(part.t_ns[-1])), (int(log.imu.t_ns[0]), end_ns))
             )
+
+
+def _wrong_clock(name: str, span_ns: tuple[int, int], imu_ns: tuple[int, int]) -> str:
+    """Return that a stream lies wholly outside the IMU's time; both from first to last, ns."""
+    span, imu = (f"{first * 1e-9:.3f} s to {last * 1e-9:.3f} s" for first, last in (span_ns, imu_ns))
+    return (
+        f"{name}: {span} lies wholly outside the IMU's time, {imu}; "
+        "check its clock (`clock_offset_s`) and the `unit` of its time"
+    )
 
 
 def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) -> _Rows:
@@ -306,6 +347,8 @@ def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) 
         return f"time is {', '.join(map(str, values.values())) or 'beyond the clock'}"
 
     rows.refuse(np.asarray(~timed), untimed, "without a time")
+    if isinstance(part, d.Window):
+        rows.keep(opening.window(stream, part, rows.t_ns))
     if columns:
         finite = np.isfinite(np.stack([rows.raw[c].astype(float) for c in columns], axis=1))
 

@@ -221,6 +221,19 @@ class NoiseDescription(Part):
         return ImuNoise(**self.model_dump())
 
 
+class Window(Part):
+    """What is used of a log: from `from_s` on, and before `until_s`, counted from the file's first IMU sample."""
+
+    from_s: NotNegative = 0.0
+    until_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s ({self.until_s:g}) must be greater than from_s ({self.from_s:g})")
+        return self
+
+
 class SourceDescription(Part):
     """A source of columns, a time, and which rows are valid."""
 
@@ -236,8 +249,8 @@ class SourceDescription(Part):
         return self
 
 
-class StreamDescription(SourceDescription):
-    """The keys that all streams have."""
+class StreamDescription(SourceDescription, Window):
+    """The keys that all streams have. Readings outside the window are left out."""
 
     every: Annotated[int, Field(ge=1)] = 1
     """Keep every n-th of the remaining rows."""
@@ -394,7 +407,7 @@ class Streams(Part):
     heading: HeadingDescription | None = None
 
 
-class TruthDescription(Placed):
+class TruthDescription(Placed, Window):
     """The true trajectory: a TUM file, a table of ours (`trajectory`), or a stream like the others."""
 
     kind: Literal["truth", "reference"] = "truth"
@@ -475,8 +488,8 @@ class PriorDescription(Part):
         return Belief(self.t_ns, NavState(np.array(self.R_WB), *vectors), np.array(self.P))
 
 
-class Description(Part):
-    """A log's description, `log.yaml`."""
+class Description(Window):
+    """A log's description, `log.yaml`. Its window holds for all streams and the truth."""
 
     name: str | None = None
     """Name of the log in tables; the folder's name if left out."""
@@ -490,6 +503,8 @@ class Description(Part):
     origin: Origin | None = None
     """The origin of W. If left out in a geodetic log, it is the first fix (of gps, else of truth) at or after the IMU's
     start, so that the vehicle starts at zero."""
+    max_wait_s: Positive | None = None
+    """How long the start may wait for its sensors; see `initialise`."""
     recording: SerializeAsAny[Recording] | None = None
     """The file with the streams' messages. Its `format` chooses the loader, which defines the other keys."""
     streams: Streams
@@ -501,6 +516,11 @@ class Description(Part):
         """The streams and the truth that are described, by name."""
         named = {name: getattr(self.streams, name) for name in Streams.model_fields} | {"truth": self.truth}
         return {name: part for name, part in named.items() if part is not None}
+
+    def window(self, part: Window) -> Window:
+        """Return what of a stream or of the truth is used: its own window within that of the log."""
+        ends = [each.until_s for each in (self, part) if each.until_s is not None]
+        return Window.model_construct(from_s=max(self.from_s, part.from_s), until_s=min(ends, default=None))
 
     @model_validator(mode="after")
     def _messages_have_a_recording(self) -> Self:

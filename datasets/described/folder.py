@@ -57,6 +57,8 @@ def write_folder(log: Log, folder: Path | str, fmt: Literal["parquet", "csv"] = 
     described: dict[str, Any] = {"name": log.name, "notes": list(log.notes), "gravity": float(log.rig.gravity)}
     if log.origin is not None:
         described["origin"] = {"latitude_deg": float(log.origin[0]), "longitude_deg": float(log.origin[1])}
+    if log.max_wait_s is not None:
+        described["max_wait_s"] = float(log.max_wait_s)
     described["streams"] = streams
     if log.truth is not None:
         tables["truth"] = log.truth.to_pandas()

@@ -146,6 +146,7 @@ def some_log(seed: int, *, attitude: bool = False) -> Log:
         prior=Belief(t0, state, root @ root.T),
         notes=("one: of ümlauts, 'quotes'", "two"),
         origin=(41.123456789012345, -8.7),
+        max_wait_s=7.5,
     )
 
 
@@ -177,8 +178,8 @@ def test_a_written_folder_opens_to_the_same_bits(tmp_path, fmt, attitude):
         a, b = np.asarray(value), np.asarray(after[name])
         assert a.dtype == b.dtype, name
         assert a.tobytes() == b.tobytes(), name
-    assert (log.name, log.notes, log.origin, log.truth_kind) == (
-        again.name, again.notes, again.origin, again.truth_kind
+    assert (log.name, log.notes, log.origin, log.truth_kind, log.max_wait_s) == (
+        again.name, again.notes, again.origin, again.truth_kind, again.max_wait_s
     )  # fmt: skip
     assert type(again.heading) is type(log.heading)
 
@@ -516,6 +517,40 @@ def test_a_clock_that_shares_no_time_with_the_imu_is_refused(folder, changes, me
     with pytest.raises(DatasetError, match=message + r", 100.000 s to 101.900 s; .*clock_offset_s.*unit") as error:
         open_log(folder)
     assert str(error.value).startswith(str(folder))
+
+
+def test_the_window_of_the_log_and_that_of_a_stream_count_from_the_first_imu_sample(folder):
+    whole = open_log(folder)
+    describe(folder, {"from_s": 0.5, "until_s": 1.5, "streams.heading.until_s": 0.9, "max_wait_s": 4.0})
+    log = open_log(folder)
+    assert whole.max_wait_s is None
+    assert log.max_wait_s == 4.0
+    assert log.imu.t_ns.tolist() == [100_500_000_000 + i * 100_000_000 for i in range(10)]
+    assert log.heading is not None
+    assert log.heading.t_ns.tolist() == [100_500_000_000]
+    assert log.truth is not None
+    assert log.truth.t_ns.tolist() == [100_500_000_000]
+    assert "imu: 10 of 20 rows are outside the window from 0.5 s until 1.5 s and left out" in log.notes
+    assert "heading: 2 of 3 rows are outside the window from 0.5 s until 0.9 s and left out" in log.notes
+    np.testing.assert_allclose(log.gps.z[0, :2], 0.0, atol=1e-6)  # the origin is the first fix that is left
+    (folder / "own.tum").write_text("100.1 1 2 3 0 0 0 1\n100.7 2 2 3 0 0 0 1\n")
+    describe(folder, {"from_s": 0.5, "truth": {"tum": "own.tum"}})
+    assert open_log(folder).truth.t_ns.tolist() == [100_700_000_000]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"from_s": 5.0}, r"imu: 20 of 20 rows are outside the window from 5 s; change `from_s` or `until_s`"),
+        ({"from_s": 1.0, "until_s": 1.0}, r"until_s \(1\) must be greater than from_s \(1\)"),
+        ({"streams.gps.from_s": -1.0}, r"`streams.gps.from_s`: expected greater than or equal to 0, found -1.0"),
+        ({"until_s": 1.0, "streams.heading.time.unit": "ms"}, r"heading: 0.100 s to 0.101 s lies wholly outside"),
+    ],
+)
+def test_a_window_that_leaves_nothing_is_refused(folder, changes, message):
+    describe(folder, changes)
+    with pytest.raises(DatasetError, match=message):
+        open_log(folder)
 
 
 def test_a_truth_without_rows_is_refused(folder):
