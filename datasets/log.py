@@ -171,7 +171,8 @@ class Log:
         truth: trajectory to score against; None if unknown.
         truth_kind: "truth", or "reference" for the output of another filter; tables print it.
         prior: belief at the start, if the log states one (simulated logs do); else `initialise` makes it.
-        notes: what was repaired, converted, counted or fitted on reading, one sentence each.
+        notes: what was repaired, converted, counted or fitted on reading, one sentence each; a `notes.Note` where a
+            reader of the numbers should know it.
         origin: (latitude °, longitude °) of W's origin, if the log is geodetic.
         max_wait_s: how long the start may wait for its sensors, s; None: as long as `initialise` does by default.
     """

@@ -14,7 +14,18 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LEVEL = {"datasets": 0, "estimators": 1, "bench": 2}
-TYPES_OF_A_LOG = {"compiled", "compiled_cache", "epochs", "errors", "log", "rig", "state", "trajectory", "quantities"}
+TYPES_OF_A_LOG = {
+    "compiled",
+    "compiled_cache",
+    "epochs",
+    "errors",
+    "log",
+    "notes",
+    "rig",
+    "state",
+    "trajectory",
+    "quantities",
+}
 HEAVY = {"matplotlib", "pandas", "gtsam", "numba", "numpy", "scipy", "pyarrow"}
 SOURCES = [path for folder in LEVEL for path in sorted((ROOT / folder).rglob("*.py"))]
 SOURCES = [path for path in SOURCES if "__pycache__" not in path.parts]

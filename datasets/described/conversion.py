@@ -23,6 +23,7 @@ from ..errors import DatasetError
 from ..formats.columns import EXACT, Columns, read_table
 from ..formats.recording import Recording, Wanted
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream, Log
+from ..notes import Note
 from ..rig import Rig
 from ..state import Array, TimeArray
 from ..times import NS_PER, times_ns
@@ -134,7 +135,7 @@ class _Opening:
                     asked[part.message.names[which], part.message.entity][field_name] = None
         read = recording.read(self.folder, [Wanted(*key, tuple(columns)) for key, columns in asked.items()])
         self.messages = dict(zip(asked, read.columns, strict=True))
-        self.notes += read.notes
+        self.notes += [note if isinstance(note, Note) else Note(note, "damage") for note in read.notes]
 
 
 def _field(message: d.Message, column: str, recording: Recording, folder: Path) -> tuple[int, str]:
@@ -165,6 +166,7 @@ class _Rows:
         raw: (n,) per column, not converted.
         number: (n,) row in the source, from 0.
         t_ns, received_ns: (n,).
+        total: how many rows the source has.
     """
 
     stream: str
@@ -173,6 +175,7 @@ class _Rows:
     number: TimeArray
     t_ns: TimeArray
     received_ns: TimeArray
+    total: int
 
     def keep(self, mask: Mask) -> None:
         self.raw = {column: values[mask] for column, values in self.raw.items()}
@@ -180,7 +183,8 @@ class _Rows:
 
     def note(self, count: int, what: str) -> None:
         if count:
-            self.opening.notes.append(f"{self.stream}: {count} rows {what} dropped")
+            text = f"{self.stream}: {count} rows {what} dropped"
+            self.opening.notes.append(Note(text, "dropped", self.stream, count, self.total))
 
     def refuse(self, bad: Mask, complaint: Any, what: str) -> None:
         """With repair, drop the rows of `bad`; without, raise complaint(first bad row)."""
@@ -335,7 +339,7 @@ def _stream(opening: _Opening, stream: str, part: Any, columns: list[d.Column]) 
         received_ns, also = times_ns(raw[time.received], time.unit)
         received_ns, timed = received_ns + offset_ns, timed & also
 
-    rows = _Rows(stream, opening, raw, np.arange(count), t_ns, received_ns)
+    rows = _Rows(stream, opening, raw, np.arange(count), t_ns, received_ns, count)
     if valid is not None:
         good = np.isin(raw[valid.column], valid.values)
         rows.note(int(np.count_nonzero(~good)), "invalid")
