@@ -54,7 +54,11 @@ def write_folder(log: Log, folder: Path | str, fmt: Literal["parquet", "csv"] = 
         streams[name] = {"table": {"file": f"{name}.{fmt}"}, **_aiding(name, stream)}
         if name != "dvl":
             streams[name]["mounting"] = _mounting(getattr(log.rig, name))
-    described: dict[str, Any] = {"name": log.name, "notes": list(log.notes), "gravity": float(log.rig.gravity)}
+    described: dict[str, Any] = {
+        "name": log.name,
+        "notes": [str(note) for note in log.notes],
+        "gravity": float(log.rig.gravity),
+    }
     if log.origin is not None:
         described["origin"] = {"latitude_deg": float(log.origin[0]), "longitude_deg": float(log.origin[1])}
     if log.max_wait_s is not None:
