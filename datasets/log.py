@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from .errors import DatasetError
+from .imu_time import gaps_ns, sampling_ns
 from .rig import Rig
 from .state import Array, Belief, TimeArray
 from .trajectory import Trajectory
@@ -63,10 +65,20 @@ class ImuStream:
             raise DatasetError(f"imu: {len(self.t_ns)} samples; at least two are needed")
         check_rows("imu", self.t_ns, {"gyro": self.w_WI_I, "accel": self.f_I}, strict=True)
 
-    @property
+    @cached_property
+    def sampling_ns(self) -> TimeArray:
+        """(n,) sampling interval about each sample; a rate may change during a log."""
+        return sampling_ns(self.t_ns)
+
+    @cached_property
+    def gaps_ns(self) -> TimeArray:
+        """(n,) how long samples are missing before each sample, 0 where none is; see `imu_time`."""
+        return gaps_ns(self.t_ns)
+
+    @cached_property
     def period_ns(self) -> int:
-        """Median sampling interval."""
-        return int(np.median(np.diff(self.t_ns)))
+        """Typical sampling interval: the median of `sampling_ns`."""
+        return int(np.median(self.sampling_ns))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ TYPES_OF_A_LOG = {
     "compiled_cache",
     "epochs",
     "errors",
+    "imu_time",
     "log",
     "notes",
     "rig",

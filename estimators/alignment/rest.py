@@ -61,7 +61,10 @@ def is_quiet(log: Log, start_ns: int, end_ns: int) -> bool:
     """Return whether the IMU shows only its noise, and the gyro at most its turn-on bias."""
     imu, noise = log.imu, log.rig.imu_noise
     inside = (imu.t_ns > start_ns) & (imu.t_ns <= end_ns)
-    dt_s, n = imu.period_ns * 1e-9, int(inside.sum())
+    n = int(inside.sum())
+    if not n:
+        return False
+    dt_s = float(np.median(imu.sampling_ns[inside])) * 1e-9
     size = max(round(BLOCK_S / dt_s), 2)
     if n < 2 * size:
         return False
