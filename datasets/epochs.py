@@ -134,8 +134,8 @@ def cut(
 
 def _intervals(log: Log, start_ns: int) -> tuple[TimeArray, TimeArray]:
     """Return the time since the sample before (or since the start), and the gap in it, for each sample, (n,) ns."""
-    first, period_ns = int(log.imu.t_ns[0]), int(log.imu.sampling_ns[0])
-    interval, gap = np.diff(log.imu.t_ns, prepend=min(start_ns, first - period_ns)), log.imu.gaps_ns.copy()
+    period_ns, gap = int(log.imu.sampling_ns[0]), log.imu.gaps_ns.copy()
+    interval = np.diff(log.imu.t_ns, prepend=min(start_ns, log.imu.start_ns))
     gap[0] = interval[0] - period_ns if interval[0] > GAP_FACTOR * period_ns else 0
     return interval, gap
 

@@ -75,6 +75,11 @@ class ImuStream:
         """(n,) how long samples are missing before each sample, 0 where none is; see `imu_time`."""
         return gaps_ns(self.t_ns)
 
+    @property
+    def start_ns(self) -> int:
+        """Start of the first sample's interval."""
+        return int(self.t_ns[0] - self.sampling_ns[0])
+
     @cached_property
     def period_ns(self) -> int:
         """Typical sampling interval: the median of `sampling_ns`."""
@@ -212,7 +217,7 @@ class Log:
     @property
     def start_ns(self) -> int:
         """Start of the voyage: the prior's time, else the start of the first IMU sample's interval."""
-        return self.prior.t_ns if self.prior is not None else int(self.imu.t_ns[0]) - self.imu.period_ns
+        return self.prior.t_ns if self.prior is not None else self.imu.start_ns
 
     @property
     def duration_s(self) -> float:
