@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .imu_time import GAP_FACTOR
 from .log import AttitudeStream, Log
-from .state import TimeArray
+from .state import Array, TimeArray
 
 DVL, DEPTH, GPS, HEADING, ATTITUDE = range(5)
 """Kinds of readings, as READING and compiled code number them."""
@@ -22,7 +23,7 @@ IMU_SAMPLE = np.dtype(
     [
         ("t_ns", "i8"),  # end of the interval
         ("dt_s", "f8"),  # its length
-        ("held_s", "f8"),  # length of the gap that this row is part of, in which the sample before is held; else 0
+        ("held_s", "f8"),  # in a gap, in which the sample before is held: its length (less if short: `_held_s`); else 0
         ("period_s", "f8"),  # sampling period of the IMU, also where a sample was split
         ("w_WI_I", "f8", (3,)),
         ("f_I", "f8", (3,)),
@@ -30,8 +31,12 @@ IMU_SAMPLE = np.dtype(
 )
 READING = np.dtype([("kind", "i8"), ("t_ns", "i8"), ("received_ns", "i8"), ("z", "f8", (9,)), ("sigma", "f8", (3,))])
 
-GAP_FACTOR = 1.5
-"""An interval longer than this many sampling periods is a gap."""
+MOST_BRIDGED = 0.2
+"""Share of a log: with less than four fifths of its motion measured, an estimate is not of an IMU any more."""
+STRAYS_S = 0.1
+"""A rate strays as far as `physics.imu` says in a tenth of a second or more (1 rad/s², 5 m/s³); in less, less far."""
+IMU_GAP = "imu gap at"
+"""How the cause of a voyage begins that ends at a gap of the IMU; its estimates hold up to there."""
 
 
 class Epoch(NamedTuple):
@@ -58,8 +63,8 @@ class Voyage:
     Attributes:
         epochs: in the order of reception.
         start_ns: start of the first IMU block.
-        counts: IMU gaps bridged, readings outside the IMU's time, and readings that measure nothing (every sigma
-            infinite).
+        counts: IMU gaps bridged and how long they are in all (ms), readings outside the IMU's time, and readings that
+            measure nothing (every sigma infinite).
         failure: why the voyage ends early, with the time; or None.
     """
 
@@ -98,20 +103,24 @@ def cut(
         ticks_ns: (k,) increasing; times at which a belief will be asked for. Those outside the IMU's time are ignored.
         sensors: aiding sensors to keep; all when None.
         max_gap_s: longest gap of the IMU that is bridged: the last sample is held, and the covariance grows. A longer
-            one ends the voyage, with `failure` set.
+            one ends the voyage, with `failure` set; and so does the gap at which all of them together exceed both
+            max_gap_s and MOST_BRIDGED of the log.
     """
-    start_ns, end_ns = log.start_ns, int(log.imu.t_ns[-1])
-    failure, end_ns, gaps = _first_long_gap(log, start_ns, end_ns, max_gap_s)
+    start_ns = log.start_ns
+    interval, gap = _intervals(log, start_ns)
+    failure, end_ns = _last_gap(log, start_ns, interval, gap, max_gap_s)
+    bridged = gap[(log.imu.t_ns > start_ns) & (log.imu.t_ns <= end_ns)]
 
     readings = reading_table(log, sensors)
     inside = (readings["t_ns"] > start_ns) & (readings["received_ns"] <= end_ns)
     void = inside & ~np.isfinite(readings["sigma"]).any(axis=1)
-    counts = {"imu_gaps_bridged": gaps, "readings_outside": int((~inside).sum()), "readings_void": int(void.sum())}
+    counts = {"imu_gaps_bridged": int(np.count_nonzero(bridged)), "imu_gaps_ms": round(int(bridged.sum()) * 1e-6)}
+    counts |= {"readings_outside": int((~inside).sum()), "readings_void": int(void.sum())}
     readings = readings[inside & ~void]
     ticks = np.zeros(0, np.int64) if ticks_ns is None else ticks_ns[(ticks_ns > start_ns) & (ticks_ns <= end_ns)]
 
     times = np.union1d(readings["received_ns"], ticks)
-    samples = _imu_table(log, times, start_ns, end_ns)
+    samples = _imu_table(log, times, start_ns, end_ns, interval, gap)
     imu_stop = np.searchsorted(samples["t_ns"], times, side="right").tolist()
     reading_stop = np.searchsorted(readings["received_ns"], times, side="right").tolist()
     is_tick = np.isin(times, ticks).tolist()
@@ -123,34 +132,47 @@ def cut(
     return Voyage(epochs, start_ns, counts, failure)
 
 
-def _first_long_gap(log: Log, start_ns: int, end_ns: int, max_gap_s: float) -> tuple[str | None, int, int]:
-    """Return (failure, end of the usable IMU data, gaps bridged before it)."""
-    t_ns, step = log.imu.t_ns, _intervals(log, start_ns)
-    after = t_ns > start_ns
-    long = np.flatnonzero(after & (step > max_gap_s * 1e9))
-    failure = None
-    if len(long):
-        end_ns = int(t_ns[long[0]] - step[long[0]])
-        failure = f"imu gap at {(end_ns - start_ns) * 1e-9:.3f} s: {step[long[0]] * 1e-9:.3f} s without a sample"
-    bridged = after & (t_ns <= end_ns) & (step > GAP_FACTOR * log.imu.period_ns)
-    return failure, end_ns, int(np.count_nonzero(bridged))
+def _intervals(log: Log, start_ns: int) -> tuple[TimeArray, TimeArray]:
+    """Return the time since the sample before (or since the start), and the gap in it, for each sample, (n,) ns."""
+    period_ns, gap = int(log.imu.sampling_ns[0]), log.imu.gaps_ns.copy()
+    interval = np.diff(log.imu.t_ns, prepend=min(start_ns, log.imu.start_ns))
+    gap[0] = interval[0] - period_ns if interval[0] > GAP_FACTOR * period_ns else 0
+    return interval, gap
 
 
-def _intervals(log: Log, start_ns: int) -> TimeArray:
-    """Return the time since the sample before, for each IMU sample, (n,) ns."""
-    first = int(log.imu.t_ns[0])
-    return np.diff(log.imu.t_ns, prepend=min(start_ns, first - log.imu.period_ns))
+def _last_gap(log: Log, start_ns: int, interval: TimeArray, gap: TimeArray, max_gap_s: float) -> tuple[str | None, int]:
+    """Return why the voyage ends at a gap, or None, and the end of its IMU data."""
+    t_ns, last_ns = log.imu.t_ns, int(log.imu.t_ns[-1])
+    most_ns = max(MOST_BRIDGED * (last_ns - start_ns), max_gap_s * 1e9)
+    in_all = np.cumsum(np.where(t_ns > start_ns, gap, 0))
+    long = interval > max_gap_s * 1e9
+    ends = np.flatnonzero((t_ns > start_ns) & (long | (in_all > most_ns)))
+    if not len(ends):
+        return None, last_ns
+    row = ends[0]
+    end_ns = int(t_ns[row] - interval[row])
+    why = f"{interval[row] * 1e-9:.3f} s without a sample"
+    if not long[row]:
+        why = f"gaps of {in_all[row] * 1e-9:.3f} s in all, more than {MOST_BRIDGED:.0%} of the log"
+    return f"{IMU_GAP} {(end_ns - start_ns) * 1e-9:.3f} s: {why}", end_ns
 
 
-def _imu_table(log: Log, times: TimeArray, start_ns: int, end_ns: int) -> NDArray[Any]:
+def _held_s(gap: TimeArray) -> Array:
+    """Return for how long each gap (n,) ns counts, s: its length, less where it is short; variance is by its square."""
+    gap_s = gap * 1e-9
+    return np.asarray(gap_s * np.minimum(gap_s / STRAYS_S, 1.0) ** 2)
+
+
+def _imu_table(
+    log: Log, times: TimeArray, start_ns: int, end_ns: int, interval: TimeArray, gap: TimeArray
+) -> NDArray[Any]:
     """Return the samples after start_ns as IMU_SAMPLE rows, split at `times`.
 
     In a gap the sample before is held, up to one period before the next one, so that no row uses a later sample.
     """
-    imu, period_ns = log.imu, log.imu.period_ns
-    interval = _intervals(log, start_ns)
-    is_gap = interval > GAP_FACTOR * period_ns
-    edges = np.union1d(times, imu.t_ns[is_gap] - period_ns)
+    imu, is_gap = log.imu, gap > 0
+    held_until = imu.t_ns - interval + gap
+    edges = np.union1d(times, held_until[is_gap])
     edges = edges[(edges > start_ns) & (edges <= end_ns)]
     own = imu.t_ns[(imu.t_ns > start_ns) & (imu.t_ns <= end_ns)]
     if not len(own):
@@ -159,11 +181,11 @@ def _imu_table(log: Log, times: TimeArray, start_ns: int, end_ns: int) -> NDArra
     t_ns = np.insert(own, np.searchsorted(own, between), between) if len(between) else own
 
     source = np.searchsorted(imu.t_ns, t_ns)
-    held = is_gap[source] & (t_ns <= imu.t_ns[source] - period_ns)
+    held = is_gap[source] & (t_ns <= held_until[source])
     table = np.zeros(len(t_ns), IMU_SAMPLE)
-    table["t_ns"], table["period_s"] = t_ns, period_ns * 1e-9
+    table["t_ns"], table["period_s"] = t_ns, imu.period_ns * 1e-9
     table["dt_s"] = np.diff(t_ns, prepend=start_ns) * 1e-9
-    table["held_s"] = np.where(held, (interval[source] - period_ns) * 1e-9, 0.0)
+    table["held_s"] = np.where(held, _held_s(gap)[source], 0.0)
     source = np.where(held, np.maximum(source - 1, 0), source)
     table["w_WI_I"], table["f_I"] = imu.w_WI_I[source], imu.f_I[source]
     return table

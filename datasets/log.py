@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DatasetError
+from .imu_time import gaps_ns, sampling_ns
 from .rig import Rig
 from .rotations import UNHEARD, complaint, off_rotation
 from .state import Array, Belief, TimeArray
@@ -70,10 +72,25 @@ class ImuStream:
             raise DatasetError(f"imu: {len(self.t_ns)} samples; at least two are needed")
         check_rows("imu", self.t_ns, {"gyro": self.w_WI_I, "accel": self.f_I}, strict=True)
 
+    @cached_property
+    def sampling_ns(self) -> TimeArray:
+        """(n,) sampling interval about each sample; a rate may change during a log."""
+        return sampling_ns(self.t_ns)
+
+    @cached_property
+    def gaps_ns(self) -> TimeArray:
+        """(n,) how long samples are missing before each sample, 0 where none is; see `imu_time`."""
+        return gaps_ns(self.t_ns)
+
     @property
+    def start_ns(self) -> int:
+        """Start of the first sample's interval."""
+        return int(self.t_ns[0] - self.sampling_ns[0])
+
+    @cached_property
     def period_ns(self) -> int:
-        """Median sampling interval."""
-        return int(np.median(np.diff(self.t_ns)))
+        """Typical sampling interval: the median of `sampling_ns`."""
+        return int(np.median(self.sampling_ns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +222,7 @@ class Log:
     @property
     def start_ns(self) -> int:
         """Start of the voyage: the prior's time, else the start of the first IMU sample's interval."""
-        return self.prior.t_ns if self.prior is not None else int(self.imu.t_ns[0]) - self.imu.period_ns
+        return self.prior.t_ns if self.prior is not None else self.imu.start_ns
 
     @property
     def duration_s(self) -> float:

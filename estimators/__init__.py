@@ -2,6 +2,7 @@
 
 physics/            rotations, state, IMU block, measurements, elimination: compiled, written once
 alignment/          the initial state from a log
+unknown_start       which starts an estimator refuses
 interface           `Estimator` and `Pass`; registry: estimators by name; stages: where the time of a step goes
 filters/            Kalman filters, and rts on top of eskf
 smoothers           options of every smoother; robust: losses

@@ -11,6 +11,7 @@ from ..datasets.state import Array, Belief
 from .graph.smoothers import WholeLogSmoother
 from .graph.solvers import BatchSolver, Solver
 from .interface import Pass
+from .unknown_start import refuse_unknown_heading, refuse_unknown_velocity
 from .window.window_pass import Solving, WindowPass
 
 GUESS_KEYFRAMES = 50
@@ -33,6 +34,8 @@ class BatchSmoother(WholeLogSmoother):
         """See `Estimator.begin`."""
         if self.engine == "gtsam":
             return super().begin(prior, rig)
+        refuse_unknown_heading(prior)
+        refuse_unknown_velocity(prior)
         solving = Solving(self.relinearize, self.extra_updates, reach=GUESS_KEYFRAMES, to_optimum=True)
         return WindowPass(self, solving, prior, rig)
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from textwrap import shorten
 
-from ..results.summary import Record, groups
+from ..results.summary import Record, ended_at_gap, groups
 
 CAUSE_WIDTH = 160
 """Letters of a cause that a line shows: two lines of a terminal of 80 columns."""
@@ -22,7 +22,8 @@ def failures(rows: Sequence[Record]) -> list[str]:
         elif row["status"] != "done":
             of_seed = "" if seed is None else f" seed {seed}"
             when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
-            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {shorten(row['cause'], CAUSE_WIDTH)}")
+            part = "; scored up to there" if ended_at_gap(row) else ""
+            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {shorten(row['cause'], CAUSE_WIDTH)}{part}")
     return list(dict.fromkeys(lines))
 
 

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
+from ...datasets.epochs import IMU_GAP
 from ..metrics.consistency import anees_of, pooled_nis
 from ..metrics.floor_ratio import OVER, rmse_over_floor
 from ..metrics.pose_error import pooled_rmse
@@ -67,13 +68,14 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
 
 
 def summarise(rows: pd.DataFrame) -> list[Record]:
-    """Return one record per log, estimator and output, over the seeds that finished.
+    """Return one record per log, estimator and output, over the seeds that finished; if none did, over those that ended
+    at a gap of the IMU, each up to its gap.
 
     Squared errors are pooled before the root, NIS over all readings. Percentages, CEP50, NEES and coverage are means;
-    costs are medians. `done` of `runs` are pooled; `diverged`, `failed` and `absent` count the rest; where none is
-    done, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, per degree of freedom, with
-    the number of those times at which it lies above and below its interval. `start` lists where the priors came from,
-    `missing` says by a score's name why it is None.
+    costs are medians. `done` of `runs` are pooled; `diverged`, `failed` and `absent` count the rest; where there is
+    nothing to pool, the numbers are None. `anees_*` is the mean over the fixed times of `consistency`, per degree of
+    freedom, with the number of those times at which it lies above and below its interval. `start` lists where the
+    priors came from, `missing` says by a score's name why it is None.
     """
     every = records(rows)
     ends = {
@@ -84,6 +86,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
     summary = []
     for (log, label, output), group in groups(every, "log", "label", "output").items():
         done = [row for row in group if row["status"] == "done"]
+        scored = done or [row for row in group if ended_at_gap(row)]
         record: Record = {"log": log, "label": label, "output": output}
         record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
         starts = dict.fromkeys(row["start"] for row in group if row.get("start") is not None)
@@ -91,17 +94,22 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= _rpe_step(group)
         record |= {"runs": len(ends[log, label]), "done": len(done)}
         record |= {status: ends[log, label].count(status) for status in UNFINISHED}
-        record |= {n: sum(row[n] or 0 for row in done) for n in ("n_scored", "n_rpe")}
-        record |= {name: _pooled(done, name, n) for name, n in POOLED.items()}
-        record |= {name: _over_seeds(fmean, done, name) for name in MEAN}
-        record |= {name: _over_seeds(median, done, name) for name in MEDIAN}
-        record |= _over_floor(done)
-        record |= _consistency(done)
-        counts = [json.loads(row["counts"] or "{}") for row in done]
+        record |= {n: sum(row[n] or 0 for row in scored) for n in ("n_scored", "n_rpe")}
+        record |= {name: _pooled(scored, name, n) for name, n in POOLED.items()}
+        record |= {name: _over_seeds(fmean, scored, name) for name in MEAN}
+        record |= {name: _over_seeds(median, scored, name) for name in MEDIAN}
+        record |= _over_floor(scored)
+        record |= _consistency(scored)
+        counts = [json.loads(row["counts"] or "{}") for row in scored]
         record |= {name: sum(run.get(of, 0) for run in counts) for name, of in counted.items()}
-        record["missing"] = {name: why for name, why in _missing(done).items() if record.get(name) is None}
+        record["missing"] = {name: why for name, why in _missing(scored).items() if record.get(name) is None}
         summary.append(record)
     return summary
+
+
+def ended_at_gap(row: Record) -> bool:
+    """Return whether a run ended at a gap of the IMU: its scores are right, of the part before it."""
+    return row["status"] == "failed" and (row.get("cause") or "").startswith(IMU_GAP)
 
 
 def _rpe_step(group: Sequence[Record]) -> Record:

@@ -24,7 +24,8 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ...datasets.log import Log
+from ...datasets.log import AttitudeStream, Log
+from ...datasets.notes import Note
 from ...datasets.rig import EARTH_RATE_RAD_S
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief, NavState, TimeArray
 from ..physics.so3 import skew
@@ -35,13 +36,17 @@ MOTION_M_S2 = 0.1
 """Sigma of the vehicle's own mean acceleration in B over the window: where no sensor measures it, it appears
 as tilt."""
 HEADING_FLOOR_RAD = np.radians(1.0)
-"""Least sigma of a heading by sensor: its errors do not average out over a window."""
+"""Least sigma of a heading or an attitude by sensor: its errors do not average out over a window."""
 UNKNOWN_HEADING_RAD = np.pi / np.sqrt(3)
 """Standard deviation of a heading that is equally likely in every direction."""
 SLIP_RAD = 0.05
 """Sigma of the drift angle of a vehicle whose sideways velocity is not measured."""
 UNKNOWN_SPEED_M_S, FASTEST_M_S = 1.5, 30.0
 """Sigma of an unknown velocity; and of one from fixes, of a ship or a car as well."""
+SILENCE_S = 2.0
+"""A DVL's first velocity is taken as that of so long before it, and its last as that of so long after."""
+LONGEST_LOST_S = 60.0
+"""A longer gap before the start counts as this long: it is more likely a wrong stamp than a voyage."""
 ORIGIN_SIGMA_M = 0.5
 """Sigma of the vehicle's position at the start of the log relative to W's origin."""
 UNKNOWN_DEPTH_M = 5.0
@@ -111,6 +116,7 @@ class InitialState:
     Attributes:
         belief: at end_ns.
         heading: its source: "sensor", "by GPS", "unknown".
+        knows_velocity: it is measured, or the vehicle rests.
         yaw_sigma: rad.
         notes: sentences on how each part was found.
     """
@@ -138,6 +144,9 @@ class InitialState:
         fixes, depths = self._whole.heard(log.gps), self._window.heard(log.depth)
         self._fixes = fixes if heading_by_gps or not self._knows_speed else fixes[-1:]
         self._depths = depths[-NEWEST:] if self._knows_speed else depths
+        self.knows_velocity = self._knows_speed or len(self._fixes) > 1
+        self._silent_s = self._without_dvl()
+        self._level, self._up = np.eye(3), np.array([0.0, 0.0, 1.0])
         self._way, self._way_by_gyro = self._ways()
         self._levelled_by = 0  # readings of the DVL
         self._stretch = 1.0  # of the sigma of GPS
@@ -152,8 +161,11 @@ class InitialState:
         else:
             self._know_motion(linear)
         x = self._solved(linear, None)[0]
+        self._level, self._up = level(x[GRAVITY]), up(x[GRAVITY])
         if self.heading == "by GPS":
             x[YAW] = self._first_yaw(x)
+        elif self.heading == "sensor" and isinstance(self._log.heading, AttitudeStream):
+            x[YAW] = self._yaw_of(self._log.heading, x)
         x, cov = self._iterated(linear, x)
         if self.heading == "by GPS":
             self._stretch = self._misfit(x)
@@ -256,9 +268,12 @@ class InitialState:
             return
         heading, w = self._log.heading, self._whole
         assert heading is not None
+        if isinstance(heading, AttitudeStream):
+            self._know_attitude(rows, heading, x)
+            return
         psi, sigma = heading.psi[self._headings], np.nanmin(heading.sigma[self._headings], axis=1)
         k = w.moments(heading.t_ns[self._headings])
-        R_level = level(x[GRAVITY])
+        R_level = self._levelled(x)
         a_E = w.R_EB[k] @ self._rig.heading.R_BS[:, 0]
         h = a_E @ R_level.T
         left = psi - np.arctan2(h[:, 1], h[:, 0]) - x[YAW]
@@ -272,6 +287,30 @@ class InitialState:
         H[0, YAW], H[0, GRAVITY], H[0, GYRO] = 1.0, by_turn.mean(axis=0) @ tilt_by_gravity(x[GRAVITY]), by_gyro
         mean = np.arctan2(np.sin(left).mean(), np.cos(left).mean())
         rows.add(H, np.array([mean]), total, x)
+
+    def _know_attitude(self, rows: Rows, attitude: AttitudeStream, x: Array) -> None:
+        """Add the mean of the attitudes, about each axis of B that any of them measures."""
+        k, sigma = self._whole.moments(attitude.t_ns[self._headings]), attitude.sigma[self._headings]
+        R_EB = self._whole.R_EB[k]
+        R_WB = attitude.z[self._headings].reshape(-1, 3, 3) @ np.asarray(self._rig.heading.R_BS).T
+        missed = Rotation.from_matrix(R_WB.transpose(0, 2, 1) @ self._attitude(x) @ R_EB).as_rotvec()
+        by_turn = R_EB.transpose(0, 2, 1)
+        measured = np.isfinite(sigma)
+        share = measured / np.maximum(measured.sum(axis=0), 1)  # of each reading in the mean about each axis
+        H = np.zeros((3, UNKNOWNS))
+        mean_turn = np.einsum("ni,nij->ij", share, by_turn)
+        H[:, GRAVITY], H[:, YAW] = mean_turn @ tilt_by_gravity(x[GRAVITY]), mean_turn @ up(x[GRAVITY])
+        H[:, GYRO] = np.einsum("ni,nij,njk->ik", share, by_turn, self._whole.turn[k])
+        square = np.einsum("ni,ni->i", share, np.where(measured, sigma, 0.0) ** 2)
+        total = np.where(measured.any(axis=0), np.hypot(np.sqrt(square), HEADING_FLOOR_RAD), np.inf)
+        rows.add(H, -np.einsum("ni,ni->i", share, missed), total, x)
+
+    def _yaw_of(self, attitude: AttitudeStream, x: Array) -> float:
+        """Return the yaw at which the attitudes fit best."""
+        R_EB = self._whole.R_EB[self._whole.moments(attitude.t_ns[self._headings])]
+        R_WB = attitude.z[self._headings].reshape(-1, 3, 3) @ np.asarray(self._rig.heading.R_BS).T
+        M = np.einsum("nij,nkj->ik", R_WB, self._levelled(x) @ R_EB)
+        return float(np.arctan2(M[1, 0] - M[0, 1], M[0, 0] + M[1, 1]))
 
     # --- position and path --------------------------------------------------------------------------------------------
 
@@ -292,9 +331,28 @@ class InitialState:
                     v_B[:, axis] = np.interp(t_s, t_s[w.moments(dvl.t_ns[rows])], dvl.z[rows, axis])
         return w.way(v_B)
 
+    def _without_dvl(self) -> Array:
+        """Return how long no DVL is heard between each time and the end, before its first and after its last, (n,) s.
+
+        SILENCE_S is not counted.
+        """
+        w, dvl = self._whole, self._log.dvl
+        if self.at_rest or dvl is None or not len(self._dvl):
+            return np.zeros(len(w.t_ns))
+        first_ns, last_ns = dvl.t_ns[self._dvl[[0, -1]]]
+        silent_ns = np.maximum(first_ns - w.t_ns, 0) + (w.t_ns[-1] - np.maximum(w.t_ns, last_ns))
+        return np.asarray(np.maximum(silent_ns * 1e-9 - SILENCE_S, 0.0))
+
+    @property
+    def _lost_s(self) -> float:
+        """How long of the log's beginning lies before the window, s."""
+        t_ns, start_ns = self._log.imu.t_ns, self._whole.t_ns[:1]
+        before_s = np.diff(np.concatenate([t_ns[t_ns < start_ns[0]], start_ns])) * 1e-9
+        return float(np.minimum(before_s, LONGEST_LOST_S).sum())
+
     def _point(self, x: Array, k: int, lever_B: Array) -> tuple[Array, Array]:
         """Return H (3, 19) and position (3,) in W of a point of the body at time k."""
-        R_WE, lever_E = attitude(x), self._whole.R_EB[k] @ lever_B
+        R_WE, lever_E = self._attitude(x), self._whole.R_EB[k] @ lever_B
         H = np.zeros((3, UNKNOWNS))
         by_gyro = -skew(lever_E) @ self._whole.turn[k]
         if self._knows_speed:
@@ -315,9 +373,11 @@ class InitialState:
             return REST_M_S * left_s
         if not self._knows_speed or dvl is None:
             return 0.5 * MOTION_M_S2 * left_s**2
-        sigma = dvl.sigma[self._dvl]
+        sigma, silent_s = dvl.sigma[self._dvl], float(self._silent_s[k])
         between_s = self._whole.length_s / len(self._dvl)
-        return float(np.median(sigma[np.isfinite(sigma)])) * np.sqrt(left_s * max(between_s, min(left_s, 1.0)))
+        heard_m = float(np.median(sigma[np.isfinite(sigma)])) * np.sqrt(left_s * max(between_s, min(left_s, 1.0)))
+        strayed_m = MOTION_M_S2 * np.sqrt(SILENCE_S * silent_s**3 / 3)  # a new acceleration every SILENCE_S
+        return float(np.hypot(heard_m, min(strayed_m, UNKNOWN_SPEED_M_S * silent_s)))
 
     def _know_place(self, rows: Rows, x: Array) -> None:
         """Add the fixes: the last one if velocity and heading are known, else all; without fixes, W's origin."""
@@ -328,7 +388,8 @@ class InitialState:
                 rows.add(H, gps.z[row] - p, np.hypot(self._stretch * gps.sigma[row], self._drift_m(k)), x)
         else:
             H, p = self._point(x, 0, np.zeros(3))
-            rows.add(H, -p, np.hypot([ORIGIN_SIGMA_M, ORIGIN_SIGMA_M, np.inf], self._drift_m(0)), x)
+            start_m = np.hypot(ORIGIN_SIGMA_M, UNKNOWN_SPEED_M_S * self._lost_s)
+            rows.add(H, -p, np.hypot([start_m, start_m, np.inf], self._drift_m(0)), x)
 
     @property
     def _height_by_gps(self) -> bool:
@@ -381,8 +442,21 @@ class InitialState:
 
     # --- the result ----------------------------------------------------------------------------------------------
 
+    def _levelled(self, x: Array) -> Array:
+        """Return R_WB (3, 3) at the end, less its yaw: the first level, turned by the least that fits gravity.
+
+        So a change of gravity never turns the yaw, nose up or down either.
+        """
+        a, b = up(x[GRAVITY]), self._up
+        S = skew(np.cross(a, b))
+        return np.asarray(self._level @ (np.eye(3) + S + S @ S / (1.0 + a @ b)))
+
+    def _attitude(self, x: Array) -> Array:
+        """Return R_WB (3, 3) at the end."""
+        return np.asarray(Rotation.from_euler("Z", x[YAW]).as_matrix() @ self._levelled(x))
+
     def _as_belief(self, x: Array, cov: Array) -> Belief:
-        R_WB, w, A = attitude(x), self._window, np.zeros((DIM, UNKNOWNS))
+        R_WB, w, A = self._attitude(x), self._window, np.zeros((DIM, UNKNOWNS))
         A[THETA, GRAVITY], A[THETA, YAW] = tilt_by_gravity(x[GRAVITY]), up(x[GRAVITY])
         A[POSITION, PLACE] = A[ACCEL_BIAS, ACCEL] = A[GYRO_BIAS, GYRO] = np.eye(3)
         if self._knows_speed:
@@ -416,7 +490,8 @@ class InitialState:
         elif self.heading == "by GPS":
             notes += [f"heading from fitting the track of gyro and DVL to {fixes} fixes, sigma {sigma_deg:.1f} deg"]
         else:
-            notes += ["no readings of a heading sensor, and no track to fit to fixes: heading unknown"]
+            text = "no readings of a heading sensor, and no track to fit to fixes: heading unknown"
+            notes += [Note(text, "start", "heading")]
         if self._stretch > 1.0:
             notes += [f"the residuals of the fixes are {self._stretch:.1f} times their sigma: sigma enlarged"]
         if self.at_rest:
@@ -428,11 +503,13 @@ class InitialState:
         elif fixes > 1:
             notes += [f"no DVL readings: velocity from {fixes} fixes"]
         else:
-            notes += ["no DVL readings: velocity unknown, taken as zero"]
+            notes += [Note("no DVL readings: velocity unknown, taken as zero", "start", "dvl")]
         if fixes:
             notes += [f"position from {fixes} fixes" if fixes > 1 else "position from the last fix"]
         else:
             notes += ["position zero at the start by definition of W, plus the distance travelled since"]
+            if self._lost_s > 0:
+                notes += [f"the way of the {self._lost_s:.1f} s before that is not known: sigma enlarged"]
         if depths:
             notes += [f"height from {depths} depth readings"]
         elif not self._height_by_gps:
@@ -469,8 +546,3 @@ def level(gravity_B: Array) -> Array:
     """Return R_WB (3, 3) of yaw zero."""
     x, y, z = up(gravity_B)
     return Rotation.from_euler("ZYX", [0.0, np.arctan2(-x, np.hypot(y, z)), np.arctan2(y, z)]).as_matrix()
-
-
-def attitude(x: Array) -> Array:
-    """Return R_WB (3, 3) of the unknowns."""
-    return Rotation.from_euler("Z", x[YAW]).as_matrix() @ level(x[GRAVITY])

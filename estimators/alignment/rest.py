@@ -9,8 +9,9 @@ constant heading.
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ...datasets.log import Log
+from ...datasets.log import AttitudeStream, Log
 from ...datasets.rig import EARTH_RATE_RAD_S
 from ...datasets.state import Array, TimeArray
 from .window import heard
@@ -61,7 +62,10 @@ def is_quiet(log: Log, start_ns: int, end_ns: int) -> bool:
     """Return whether the IMU shows only its noise, and the gyro at most its turn-on bias."""
     imu, noise = log.imu, log.rig.imu_noise
     inside = (imu.t_ns > start_ns) & (imu.t_ns <= end_ns)
-    dt_s, n = imu.period_ns * 1e-9, int(inside.sum())
+    n = int(inside.sum())
+    if not n:
+        return False
+    dt_s = float(np.median(imu.sampling_ns[inside])) * 1e-9
     size = max(round(BLOCK_S / dt_s), 2)
     if n < 2 * size:
         return False
@@ -95,17 +99,22 @@ def mean_velocity(log: Log, start_ns: int, end_ns: int) -> tuple[Array, Array] |
 def heading_rate(log: Log, start_ns: int, end_ns: int) -> tuple[float, float] | None:
     """Return the rate of the heading sensor and its sigma (rad/s); None if it has too few readings.
 
-    The scatter about a steady turn gives the sigma, since the stated sigma may include slowly varying errors.
+    Of a full attitude it is the rate about any axis, which is not negative. The scatter about a steady turn gives the
+    sigma, since the stated sigma may include slowly varying errors.
     """
     rows = heard(log.heading, start_ns, end_ns)
     if log.heading is None or len(rows) < 4:
         return None
-    psi = np.unwrap(log.heading.psi[rows])
-    rate, spread_s = _slope(log.heading.t_ns[rows], psi[:, None])
+    if isinstance(log.heading, AttitudeStream):
+        R_WH = log.heading.z[rows].reshape(-1, 3, 3)
+        angles = Rotation.from_matrix(R_WH[0].T @ R_WH).as_rotvec()
+    else:
+        angles = np.unwrap(log.heading.psi[rows])[:, None]
+    rate, spread_s = _slope(log.heading.t_ns[rows], angles)
     t_s = (log.heading.t_ns[rows] - log.heading.t_ns[rows].mean()) * 1e-9
-    left = psi - psi.mean() - rate[0] * (t_s - t_s.mean())
-    scatter = np.sqrt(left @ left / (len(rows) - 2))
-    return float(rate[0]), float(scatter / spread_s)
+    left = angles - angles.mean(axis=0) - np.outer(t_s - t_s.mean(), rate)
+    scatter = np.sqrt(np.einsum("nk,nk->k", left, left).max() / (len(rows) - 2))
+    return float(rate[0]) if len(rate) == 1 else float(np.linalg.norm(rate)), float(scatter / spread_s)
 
 
 def _slope(t_ns: TimeArray, values: Array) -> tuple[Array, float]:

@@ -96,10 +96,11 @@ class Window:
 
 
 def heard(stream: ReadingStream | None, start_ns: int, end_ns: int) -> TimeArray:
-    """Return the rows of a stream that were taken after start_ns and received by end_ns."""
+    """Return the rows of a stream that were taken after start_ns and received by end_ns, and measure anything."""
     if stream is None:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero((stream.t_ns > start_ns) & (stream.received_ns <= end_ns))
+    inside = (stream.t_ns > start_ns) & (stream.received_ns <= end_ns)
+    return np.flatnonzero(inside & np.isfinite(stream.sigma).any(axis=1))
 
 
 def to_the_end(steps: Array) -> Array:

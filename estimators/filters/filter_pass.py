@@ -9,14 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from ...datasets.epochs import SENSOR, Epoch
+from ...datasets.epochs import DVL, SENSOR, Epoch
 from ...datasets.quantities import NotNegative, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
@@ -26,6 +26,7 @@ from ..physics.imu import BLOCK, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
 from ..stages import staged
+from ..unknown_start import knows_heading, refuse_unknown_heading
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,15 @@ class Kalman(ABC):
     """A filter: predicts a STATE record (of length 1) over a motion, and corrects it by readings, in place.
 
     Its P may be of an error of its own, which `error_covariance` converts to ours. Either step may raise Diverged.
+
+    Attributes:
+        stopped_by: the kind of reading that it cannot take while the heading is unknown since the start; by default
+            a velocity in B, which it would turn into W by a heading that it only guesses.
+        freed_by: the kind of reading after which it can take all; None if there is none.
     """
+
+    stopped_by: ClassVar[int] = DVL
+    freed_by: ClassVar[int | None] = None
 
     @abstractmethod
     def predict(
@@ -115,6 +124,8 @@ class FilterPass:
         self._before: NDArray[Any] | None = None
         self._block = np.zeros(1, BLOCK)
         self._past: deque[PastEpoch] = deque()
+        self._kalman = kalman
+        self._is_lost = not knows_heading(self._own_belief())
 
     @property
     def rig(self) -> NDArray[Any]:
@@ -133,8 +144,7 @@ class FilterPass:
 
     def belief(self) -> Belief:
         """See `Pass.belief`."""
-        state = as_belief(self._t_ns, self._state).state
-        return with_rate_noise(Belief(self._t_ns, state, self._covariance(self._state)), self._rig)
+        return with_rate_noise(self._own_belief(), self._rig)
 
     def finish(self) -> Trajectory | None:
         """Return None: a filter does not smooth."""
@@ -154,6 +164,8 @@ class FilterPass:
             self._predict(self._state, self._rig, self._before, epoch.imu, self._block)
             self._before = epoch.imu[-1:]
         readings = epoch.readings
+        if self._is_lost and len(readings):
+            self._look_for_heading(readings)
         if self._widths is not None and len(readings):
             readings = self._gated(readings, self._widths, outliers)
             self.counts.update(outliers)
@@ -162,6 +174,23 @@ class FilterPass:
         if self._on_epoch is not None:
             self._on_epoch(epoch, self._state, self._block)
         self._t_ns = epoch.t_ns
+
+    def _own_belief(self) -> Belief:
+        """Return the belief without the rate noise of the moment."""
+        return Belief(self._t_ns, as_belief(self._t_ns, self._state).state, self._covariance(self._state))
+
+    def _look_for_heading(self, readings: NDArray[Any]) -> None:
+        """Look whether readings can be taken that come while the heading is unknown since the start.
+
+        Raises:
+            StartError: they cannot.
+        """
+        kinds = {kind for kind in readings["kind"].tolist() if SENSOR[kind] in self._config.factors}
+        if self._kalman.freed_by in kinds:
+            self._is_lost = False
+        elif self._kalman.stopped_by in kinds:
+            refuse_unknown_heading(self._own_belief())
+            self._is_lost = False
 
     def _gated(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
         """Return the readings that pass their gates, and count the others as outliers."""

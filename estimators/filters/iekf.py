@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
 from ...datasets.compiled import compiled, inner
+from ...datasets.epochs import DVL, GPS
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, POSITION, THETA, VELOCITY, Array, Belief
 from ..physics.blocks import identity, set_block, set_product
@@ -46,6 +47,7 @@ from ..physics.measurements import measure
 from ..physics.so3 import cross_into, exp, product, right_jacobian, skew_into, transform, transform_into
 from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
 from ..stages import stage
+from ..unknown_start import refuse_unknown_velocity
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 PHI, RHO, NU = THETA, POSITION, VELOCITY
@@ -59,6 +61,7 @@ class InvariantKalmanFilter(FilterOptions):
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
+        refuse_unknown_velocity(prior)
         kalman, x = InvariantKalman(prior.state.p_WB_W.copy()), prior.state
         A = to_invariant(x.R_WB, np.zeros(3), x.v_WB_W)
         P = A @ prior.P @ A.T
@@ -67,6 +70,8 @@ class InvariantKalmanFilter(FilterOptions):
 
 class InvariantKalman(Kalman):
     """See `Kalman`; every P is of the invariant error, and positions are counted from the origin (3,)."""
+
+    stopped_by, freed_by = GPS, DVL
 
     def __init__(self, origin: Array) -> None:
         self._origin = origin

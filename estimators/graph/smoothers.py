@@ -15,6 +15,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ..interface import Pass
 from ..smoothers import GraphSmoother, LaggedSmoother
+from ..unknown_start import refuse_unknown_heading, refuse_unknown_velocity
 from .graph_pass import GraphPass
 from .solvers import BatchLagSolver, IncrementalSolver, Solver, isam2_params
 
@@ -35,6 +36,9 @@ class GtsamSmoother(GraphSmoother):
 
     def begin(self, prior: Belief, rig: Rig) -> Pass:
         """See `Estimator.begin`."""
+        if not (math.isinf(self.window_s) and not self.preintegrates):
+            refuse_unknown_heading(prior)
+            refuse_unknown_velocity(prior)
         return GraphPass(self, self.solver(rig.imu.R_BS), prior, rig)
 
 

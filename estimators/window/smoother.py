@@ -12,6 +12,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import Belief
 from ..interface import Pass
 from ..smoothers import LaggedSmoother
+from ..unknown_start import refuse_unknown_heading, refuse_unknown_velocity
 from .window_pass import Solving, WindowPass
 
 
@@ -37,4 +38,6 @@ class WindowSmoother(LaggedSmoother):
 
     def begin(self, prior: Belief, rig: Rig) -> Pass:
         """See `Estimator.begin`."""
+        refuse_unknown_heading(prior)
+        refuse_unknown_velocity(prior)
         return WindowPass(self, Solving(self.relinearize, self.extra_updates, self.relinearize_prior), prior, rig)

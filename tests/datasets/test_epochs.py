@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from driver import run_log
 from fathom.datasets import Log
-from fathom.datasets.epochs import cut
+from fathom.datasets.epochs import MOST_BRIDGED, cut
 from fathom.datasets.log import ImuStream
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
@@ -112,3 +112,43 @@ def test_a_gap_beyond_the_bound_ends_the_voyage_where_it_begins(log: Log) -> Non
     voyage = cut(with_gap(log, 10.0, 12.5), max_gap_s=2.0)
     assert voyage.failure == "imu gap at 10.000 s: 2.500 s without a sample"
     assert voyage.epochs[-1].t_ns <= log.start_ns + 10_000_000_000
+
+
+def test_a_change_of_rate_holds_no_sample_and_keeps_what_the_gyro_turned(log: Log) -> None:
+    """From 15 s on the means of two samples each."""
+    imu, half = log.imu, len(log.imu.t_ns) // 4 * 2
+    pairs = [x[half:].reshape(-1, 2, 3).mean(axis=1) for x in (imu.w_WI_I, imu.f_I)]
+    stamps = np.concatenate([imu.t_ns[:half], imu.t_ns[half + 1 :: 2]])
+    w, f = (np.concatenate([x[:half], y]) for x, y in zip((imu.w_WI_I, imu.f_I), pairs, strict=True))
+    turned = []
+    for one in (log, replace(log, imu=ImuStream(stamps, w, f))):
+        voyage = cut(one, imu.t_ns[-1:])
+        assert voyage.counts["imu_gaps_bridged"] == 0
+        rows = np.concatenate([epoch.imu for epoch in voyage.epochs])
+        assert not rows["held_s"].any()
+        turned.append((rows["w_WI_I"] * rows["dt_s"][:, None]).sum(axis=0))
+    assert turned[1] == pytest.approx(turned[0], rel=1e-9)
+
+
+def test_gaps_are_counted_and_their_length_too(log: Log) -> None:
+    counts = cut(with_gap(with_gap(log, 10.0, 10.8), 20.0, 20.3)).counts
+    assert (counts["imu_gaps_bridged"], counts["imu_gaps_ms"]) == (2, 1080)
+
+
+def test_many_gaps_end_the_voyage_where_they_exceed_a_share_of_the_log(log: Log) -> None:
+    """0.79 s of each second is missing: 6 s, a fifth of the log, are exceeded in its eighth second."""
+    gappy = log
+    for k in range(30):
+        gappy = with_gap(gappy, k + 0.2, k + 1.0)
+    voyage = cut(gappy)
+    assert voyage.failure is not None
+    assert voyage.failure.startswith("imu gap at 7.200 s: gaps of 6.320 s in all, more than 20% of the log")
+    assert voyage.counts["imu_gaps_ms"] <= MOST_BRIDGED * 30_000
+    assert voyage.epochs[-1].t_ns <= log.start_ns + 7_200_000_000
+
+
+def test_a_lost_sample_lets_a_rate_stray_less_than_a_long_gap(log: Log) -> None:
+    rows = np.concatenate([epoch.imu for epoch in cut(with_gap(log, 10.0, 10.02)).epochs])
+    held = rows["held_s"] > 0
+    assert rows["dt_s"][held].sum() == pytest.approx(0.01)
+    assert rows["held_s"][held] == pytest.approx(0.01 * 0.1**2)

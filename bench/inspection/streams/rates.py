@@ -23,6 +23,10 @@ CLUSTERED = 0.25
 """Of the median interval: two samples stamped by a regular clock are never this close."""
 MOST_CLUSTERED = 0.01
 """Share of the intervals: a few such pairs occur in any log, when a host catches up."""
+MOST_OF_TIME = 0.95
+"""Share of the samples whose rate is looked at: the first and the last seconds of a log may be slower."""
+RATE_CHANGE = 1.2
+"""Times: a rate that differs by more within a log is another setting of the device."""
 MOST_JITTER = 0.2
 """Standard deviation over the interval: with more, the stamps are not of the sampling."""
 MOST_LOST = {"imu": 0.001}
@@ -46,20 +50,21 @@ def check_rates(log: Log) -> Check:
             facts[name] = f"{len(t_ns)} readings"
             continue
         interval_s = np.diff(t_ns) * 1e-9
-        period_s = float(np.median(interval_s))
-        lost = _lost(name, interval_s, period_s)
-        clustered = float(np.mean(interval_s < CLUSTERED * period_s))
-        ratio = interval_s / period_s
+        about_s = _about_s(log, name, interval_s)
+        period_s = float(np.median(about_s))
+        lost = _lost_samples(log) if name == "imu" else _lost(name, interval_s, period_s)
+        clustered = float(np.mean(interval_s < CLUSTERED * about_s))
+        ratio = interval_s / about_s
         jitter = float(np.std(ratio - np.rint(ratio)))  # a lost reading is no jitter
         at = int(np.argmax(interval_s))
         facts[name] = (
-            f"{len(t_ns)} at {1 / period_s:.4g} Hz, jitter {jitter:.1%}, lost {lost / (len(t_ns) + lost):.2%}, "
+            f"{len(t_ns)} at {_rate(about_s)}, jitter {jitter:.1%}, lost {lost / (len(t_ns) + lost):.2%}, "
             f"longest gap {interval_s[at]:.3g} s at {seconds(log, t_ns[at]):.1f} s"
         )
         mean_hz = (len(t_ns) - 1 + lost) / ((int(t_ns[-1]) - int(t_ns[0])) * 1e-9)
         bunched = _clusters(name, clustered, jitter, period_s, mean_hz)
         findings += bunched or _gaps(log, name, t_ns, lost)  # bunches imply gaps between them
-    imu_hz = 1e9 / log.imu.period_ns
+    imu_hz = 1e9 / float(np.quantile(log.imu.sampling_ns, MOST_OF_TIME))
     if imu_hz < SLOWEST_IMU_HZ:
         findings.append(
             Finding(
@@ -90,6 +95,19 @@ def _times(log: Log) -> dict[str, TimeArray]:
     return {"imu": log.imu.t_ns} | {name: stream.t_ns for name, stream in log.streams.items()}
 
 
+def _about_s(log: Log, name: str, interval_s: Array) -> Array:
+    """Return the usual interval at each interval, (n,) s: the IMU's own about it, another sensor's median."""
+    if name == "imu":
+        return np.asarray(log.imu.sampling_ns[1:] * 1e-9)
+    return np.full(len(interval_s), np.median(interval_s))
+
+
+def _rate(about_s: Array) -> str:
+    """Return the rate, or the lowest and the highest if it changes."""
+    low, middle, high = 1 / np.quantile(about_s, [MOST_OF_TIME, 0.5, 1 - MOST_OF_TIME])
+    return f"{low:.4g} to {high:.4g} Hz" if high > RATE_CHANGE * low else f"{middle:.4g} Hz"
+
+
 def _longest_gap_s(name: str, period_s: float) -> float:
     """Return the length from which a gap is a silence rather than lost readings."""
     return max(LONGEST_IMU_GAP_S if name == "imu" else LONGEST_GAP_S, 3 * period_s)
@@ -99,6 +117,13 @@ def _lost(name: str, interval_s: Array, period_s: float) -> int:
     """Return the number of missing readings between silences; two within one period cancel a missing one."""
     short = interval_s[interval_s <= _longest_gap_s(name, period_s)]
     return max(int((np.rint(short / period_s) - 1).sum()), 0)
+
+
+def _lost_samples(log: Log) -> int:
+    """Return the number of missing IMU samples between silences."""
+    gaps, sampling = log.imu.gaps_ns, log.imu.sampling_ns
+    short = gaps <= _longest_gap_s("imu", log.imu.period_ns * 1e-9) * 1e9
+    return int(np.rint(gaps[short] / sampling[short]).sum())
 
 
 def _clusters(name: str, clustered: float, jitter: float, period_s: float, mean_hz: float) -> list[Finding]:
@@ -137,11 +162,13 @@ def _gaps(log: Log, name: str, t_ns: TimeArray, lost: int) -> list[Finding]:
                 name, f"{share:.1%} of the {name} readings are missing: {lost}, by their rate, between others{by_hand}."
             )
         )
-    longest_s = _longest_gap_s(name, float(np.median(np.diff(t_ns))) * 1e-9)
+    longest_s = _longest_gap_s(name, float(np.median(_about_s(log, name, np.diff(t_ns) * 1e-9))))
     ends_ns = [] if name == "imu" else [log.start_ns, int(log.imu.t_ns[-1])]
     inside = t_ns[(t_ns >= log.start_ns) & (t_ns <= log.imu.t_ns[-1])]
     edges_ns = np.sort(np.concatenate([inside, np.array(ends_ns, np.int64)]))
     gap_s = np.diff(edges_ns) * 1e-9
+    if name == "imu":
+        gap_s = np.where(log.imu.gaps_ns[t_ns >= log.start_ns][1:] > 0, gap_s, 0.0)
     long = np.flatnonzero(gap_s > longest_s)
     if len(long):
         at = long[np.argmax(gap_s[long])]
