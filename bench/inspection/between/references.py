@@ -13,8 +13,8 @@ from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
+from ..findings.fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
 from ..streams.channels import seconds
-from .fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
 from .inertial import Inertial, cross
 from .pair_check import Delay, PairCheck
 from .path_fit import velocities

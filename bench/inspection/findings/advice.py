@@ -8,6 +8,7 @@ which parse, and which are there only if the description with them is valid.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import replace
@@ -28,6 +29,8 @@ OTHER |= {"ENU": "NED", "NED": "ENU"}
 QUANTITIES = {"gyro": d.Rate, "accel": d.Acceleration, "velocity": d.Speeds, "depth": d.Height, "heading": d.Angle}
 USUAL = {"gyro": "rad/s", "accel": "m/s^2", "velocity": "m/s", "depth": "m", "heading": "rad"}
 """The unit that a fix of another unit is relative to, or the other way round."""
+WORDS = re.compile(r": (mirror|exchange) ")
+"""Fixes that stand for keys which only the description tells."""
 Raw = dict[str, Any]
 Changes = dict[str, Any]
 """Values by their path in log.yaml."""
@@ -38,6 +41,8 @@ def resolved(finding: Finding, description: d.Description) -> Finding:
     if not finding.fix:
         return finding
     lines = resolve(finding.fix, description.model_dump(mode="json", exclude_unset=True))
+    if lines is None and WORDS.search(finding.fix):
+        return replace(finding, fix="")  # the message says it
     if lines is None:
         return replace(finding, fix="", hint="; ".join(filter(None, (finding.fix.replace("\n", "; "), finding.hint))))
     return replace(finding, fix="\n".join(lines))
@@ -56,6 +61,14 @@ def resolve(fix: str, raw: Raw) -> list[str] | None:
     except (DatasetError, yaml.YAMLError, KeyError, TypeError, ValueError):
         return None
     return [f"{path}: {_flow(value)}" for path, value in changes.items()]
+
+
+def clock_fix(stream: str, late_s: float) -> str:
+    """Return the fix that brings a stream onto the IMU's clock, or the IMU onto the others', by how late it is, s."""
+    path = "truth" if stream == "truth" else f"streams.{stream}"
+    if late_s > 0 and stream not in ("imu", "truth"):
+        return f"{path}.time.delay_s: {late_s:.3f}"
+    return f"{path}.time.clock_offset_s: {-late_s:.3f}"
 
 
 def put(raw: Raw, path: str, value: Any) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.finding import Finding
+from ..findings.fitting import Estimate
 from .relations import ROWS, Relation, likelihood
 from .sketch import Sketch
 
@@ -227,7 +228,7 @@ def scale_findings(
         for name, (relation, Q) in every.items()
         if relation is not None and relation.n >= 10 and relation.correlation(Q) > KNOWN
     }
-    off = {name: slope for name, slope in slopes.items() if slope.differs(1.0, SCALE_MATTERS)}
+    off = {name: slope for name, slope in slopes.items() if _is_off(slope, SCALE_MATTERS)}
     if not off:
         return []
     listed = " and ".join(f"{name} {slope.text()} times as far" for name, slope in off.items())
@@ -237,7 +238,7 @@ def scale_findings(
     agreed = [a for a in off.values() if sum(abs(b.value / a.value - 1) < SCALE_MATTERS for b in off.values()) > 1]
     if len(agreed) < len(slopes):
         alone = slopes.get(HEADING) if len(off) == 1 and HEADING in off else None
-        if alone is None or not alone.differs(1.0, ALONE_MATTERS) or TRUTH in slopes:
+        if alone is None or not _is_off(alone, ALONE_MATTERS) or TRUTH in slopes:
             return []  # motion, or a truth of its own, may feign it
         return [Finding("imu", message + ": the scale of the gyro's vertical axis, or that of the heading, is off.")]
     scale = float(np.average([e.value for e in agreed], weights=[1 / max(e.sigma, 1e-6) for e in agreed]))
@@ -246,3 +247,7 @@ def scale_findings(
             message += f", the ratio of degrees and radians: the gyro is in {unit}."
             return [Finding("imu", message, f"streams.imu.gyro.unit: {unit}")]
     return [Finding("imu", message + ": the gyro's scale is off.", f"streams.imu.gyro.scale: {scale:.4g}")]
+
+
+def _is_off(slope: Estimate, by: float) -> bool:
+    return abs(slope.value - 1) > by and slope.differs(1.0, by)

@@ -11,8 +11,7 @@ import numpy as np
 from ....datasets.log import ImuStream, Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
-from ..between.clock import fix as clock_fix
-from ..between.fitting import Estimate
+from ..findings.advice import clock_fix
 from ..findings.finding import Check, Finding
 from ..streams.channels import seconds
 from ..streams.norms import NO_GRAVITY, check_norms
@@ -143,9 +142,9 @@ def _heading_clock(sketch: Sketch) -> list[Finding]:
         return []
     if heading_fits(sketch, shift.late_s):
         message = f"The IMU turns {abs(shift.late_s):.1f} s {_late(-shift.late_s)} by the clock of the others."
-        return [Finding("imu", message, clock_fix("imu", Estimate(-shift.late_s, 0.0)))]
+        return [Finding("imu", message, clock_fix("imu", -shift.late_s))]
     message = f"The heading turns {abs(shift.late_s):.1f} s {_late(shift.late_s)} by the IMU's clock."
-    return [Finding("heading", message, clock_fix("heading", Estimate(shift.late_s, 0.0)))]
+    return [Finding("heading", message, clock_fix("heading", shift.late_s))]
 
 
 def _late(shift_s: float) -> str:

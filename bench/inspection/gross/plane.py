@@ -11,9 +11,9 @@ from ....datasets.described.description import Speeds
 from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
-from ..between.clock import fix as clock_fix
-from ..between.fitting import Estimate, Plane
+from ..findings.advice import clock_fix
 from ..findings.finding import Finding
+from ..findings.fitting import Plane
 from ..streams.channels import seconds
 from .axes import CLEARLY, agreement, hypotheses
 from .shifts import LONGEST_S
@@ -47,7 +47,7 @@ SILENT_SHARE = 0.1
 """Of the time between the first and the last fix: with the DVL silent for longer, the path is not known."""
 FAR_M = 100e3
 """From W's origin: the tangent plane is 0.8 km off the sphere there, and no voyage between two fixes is so long."""
-SEARCHED = 60
+SEARCHED = 40
 """Positions with which a clock's lag is searched for on a grid; the lag is then refined with all."""
 CLOCK_NOISES, CLOCK_DRIFT = 2.0, 0.01
 """Of the stated sigma (√2 of it is the rms of the two axes), and of the extent: with less left no clock is sought."""
@@ -300,7 +300,7 @@ def _heard_under_water(sketch: Sketch, fixes: Fixes) -> Finding | None:
         f"{now:.0%} of the fixes are stamped while the depth sensor is more than {DEEP_M:g} m under water, and none if "
         f"the stamps of the GPS are taken to be {abs(late_s):.0f} s {'late' if late_s > 0 else 'early'}."
     )
-    return Finding("gps", message, clock_fix("gps", Estimate(late_s, 0.0)))
+    return Finding("gps", message, clock_fix("gps", late_s))
 
 
 def _explains(other: Match, now: Match, fixes: Fixes) -> bool:
@@ -373,9 +373,10 @@ def _clock(sketch: Sketch, course: Course, path: list[Plane], fixes: Fixes, now:
         return None
     log, some = sketch.log, fixes.some(SEARCHED)
     lags = np.arange(-LONGEST_S, LONGEST_S + 1, 2.0)
-    found = [
-        (fixes.stream, *_searched(lambda late: course.match(path, fixes, late), lags, course.scan(path, some, lags)))
-    ]
+    left = course.scan(path, some, lags)
+    if course.compass and left.min() > ALONE * left[len(lags) // 2] and now.rms_m <= fixes.allowed_m:
+        return None
+    found = [(fixes.stream, *_searched(lambda late: course.match(path, fixes, late), lags, left))]
     if now.rms_m > fixes.allowed_m and course.compass:
         lags = np.arange(-LONGEST_S / 4, LONGEST_S / 4 + 1, 4.0)
         left = np.array([course.match(course.path(late), some).rms_m for late in lags])
@@ -394,7 +395,7 @@ def _clock(sketch: Sketch, course: Course, path: list[Plane], fixes: Fixes, now:
     )
     if stream == "gps" and abs(abs(late_s) - LEAP_S) < 1:
         message += f" GPS time and UTC differ by {LEAP_S} leap seconds."
-    return Finding(stream, message, clock_fix(stream, Estimate(late_s, 0.0)))
+    return Finding(stream, message, clock_fix(stream, late_s))
 
 
 def _searched(match: Callable[[float], Match], lags: Array, left_m: Array) -> tuple[float, Match]:

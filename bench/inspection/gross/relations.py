@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ....datasets.state import Array
-from ..between.fitting import Estimate
+from ..findings.fitting import Estimate
 from .sketch import Sketch
 
 TURN_S = 3.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from ....datasets.log import Log
 from ....datasets.state import Array
-from ..between.fitting import Plane
+from ..findings.fitting import Plane
 from ..streams.channels import seconds
 
 FINEST_S = 0.5
@@ -119,7 +119,8 @@ def sketch_of(log: Log) -> Sketch | None:
     if n // size < FEWEST_CELLS:
         return None
     t_s = seconds(log, log.imu.t_ns[:n].reshape(-1, size)[:, [0, -1]]).mean(axis=1) - period_s / 2
-    w_I, f_I = (x[:n].reshape(-1, size, 3).mean(axis=1) for x in (log.imu.w_WI_I, log.imu.f_I))
+    weight = np.full(size, 1 / size)
+    w_I, f_I = (weight @ x[:n].reshape(-1, size, 3) for x in (log.imu.w_WI_I, log.imu.f_I))
     up_I = _smooth(f_I, max(round(LEVEL_S / step_s), 1) | 1)
     up_I /= np.maximum(np.linalg.norm(up_I, axis=1, keepdims=True), 1e-9)
     steps = (w_I[1:] + w_I[:-1]) / 2 * np.diff(t_s)[:, None]

@@ -9,8 +9,7 @@ import numpy as np
 from ....datasets.described.description import Height
 from ....datasets.log import Log
 from ....datasets.state import Array
-from ..between.clock import fix as clock_fix
-from ..between.fitting import Estimate
+from ..findings.advice import clock_fix
 from ..findings.finding import Finding
 from ..streams.channels import seconds
 from .shifts import Shift, shift_of
@@ -159,7 +158,7 @@ def _finding(log: Log, name: str, other: str, slope: Slope) -> Finding:
     if shift.matters and abs(shift.late_s) > CLOCK_MATTERS_S:
         late = "late" if shift.late_s > 0 else "early"
         message = f"{who} changes {abs(shift.late_s):.1f} s {late} by that of the {_words(log, other)}."
-        return Finding(name, message, clock_fix(name, Estimate(shift.late_s, 0.0)))
+        return Finding(name, message, clock_fix(name, shift.late_s))
     if abs(slope.value + 1) < 2 * SCALE_MATTERS:
         return _turned(log, name, f"climbs where the {_words(log, other)} sinks (slope {slope.value:.2f})")
     message = f"{who} changes {slope.value:.3g} times as far as by the {_words(log, other)}."

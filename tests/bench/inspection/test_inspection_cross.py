@@ -13,10 +13,10 @@ import yaml
 from fathom.bench.drawing import empty_figure
 from fathom.bench.inspection.between.clock import fit_clocks
 from fathom.bench.inspection.between.cross_checks import cross_checks
-from fathom.bench.inspection.between.fitting import Estimate, blocks_of, least_squares
 from fathom.bench.inspection.between.lever_arm import products
 from fathom.bench.inspection.between.pair_check import Delay
 from fathom.bench.inspection.findings.finding import Check, Finding
+from fathom.bench.inspection.findings.fitting import Estimate, blocks_of, least_squares
 from fathom.datasets import Log, Scenario, Trajectory, open_log, simulate
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.opening import CATALOG
