@@ -126,7 +126,7 @@ class WorkerCache:
             "duration_s": result.duration_s,
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
-            "notes": json.dumps([*log.notes, *result.notes]),
+            "notes": json.dumps([*log.notes, *task.checked, *result.notes]),
             **costs(result),
             **extra,
         }
