@@ -44,7 +44,9 @@ def resolved(finding: Finding, description: d.Description) -> Finding:
     if lines is None and WORDS.search(finding.fix):
         return replace(finding, fix="")  # the message says it
     if lines is None:
-        return replace(finding, fix="", hint="; ".join(filter(None, (finding.fix.replace("\n", "; "), finding.hint))))
+        there = "in the truth's own file, which has no such key: " * finding.fix.startswith("truth.")
+        words = there + finding.fix.replace("\n", "; ")
+        return replace(finding, fix="", hint="; ".join(filter(None, (words, finding.hint))))
     return replace(finding, fix="\n".join(lines))
 
 

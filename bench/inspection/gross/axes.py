@@ -24,6 +24,8 @@ UPRIGHT = np.cos(60 * DEGREE)
 """Least vertical part of the mean up in B: a vehicle travels more upright than this."""
 KNOWN = 0.9
 """Least correlation for a scale to be read off: what is left of it moves a slope by some 10 %."""
+SURE = 0.97
+"""The same where nothing else says so: accelerations are then under 6 % of what changes the specific force."""
 SCALE_MATTERS = 0.1
 """Relative, of a gross scale: gyros are calibrated to 1 %, and the acceleration in turns may feign some percent."""
 CLEARLY = 5.0
@@ -42,24 +44,27 @@ class Hypothesis:
     """One fault of the inertial sensors: what accelerometer (A) and gyro (G) must be multiplied by, in the IMU's axes.
 
     Attributes:
-        heading: −1 if the heading must be turned over instead, else 1.
+        heading, truth: −1 if the heading, or the truth's attitude, must be turned over instead, else 1.
     """
 
     A: Array
     G: Array
     heading: float = 1.0
+    truth: float = 1.0
 
     @property
     def is_none(self) -> bool:
         """Whether nothing is wrong by it."""
-        return bool((self.A == ONE).all() and (self.G == ONE).all() and self.heading > 0)
+        return bool((self.A == ONE).all() and (self.G == ONE).all() and min(self.heading, self.truth) > 0)
 
     def fits(self, tilt: Relation, by_heading: Relation | None, by_truth: Relation | None) -> float:
         """Return its log likelihood by what tilts and what turns."""
         of_turn = self.A.T @ self.G
         of_tilt = float(np.sign(np.linalg.det(self.A))) * of_turn
         return (
-            likelihood(tilt, of_tilt) + likelihood(by_heading, self.heading * of_turn) + likelihood(by_truth, of_turn)
+            likelihood(tilt, of_tilt)
+            + likelihood(by_heading, self.heading * of_turn)
+            + likelihood(by_truth, self.truth * of_turn)
         )
 
 
@@ -69,7 +74,7 @@ def hypotheses() -> tuple[Hypothesis, ...]:
     flips = [np.diag(signs) for signs in sorted(product((1.0, -1.0), repeat=3), key=lambda s: (-sum(s), s))][1:]
     orders = [ONE[list(order)] for order in permutations(range(3))][1:]
     turned_over = [np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])]
-    found = [Hypothesis(ONE, ONE), Hypothesis(ONE, ONE, -1.0)]
+    found = [Hypothesis(ONE, ONE), Hypothesis(ONE, ONE, heading=-1.0), Hypothesis(ONE, ONE, truth=-1.0)]
     found += [Hypothesis(one, one) for one in turned_over[:2]]
     found += [Hypothesis(one, one) for one in flips if one.sum() == 1]  # left-handed
     found += [Hypothesis(ONE, flip) for flip in flips] + [Hypothesis(flip, ONE) for flip in flips]
@@ -162,6 +167,11 @@ def axes_findings(sketch: Sketch, alike: Sequence[Hypothesis]) -> list[Finding]:
         )
         fix = "streams.heading.convention: yaw  # or compass, whichever it is not"
         return [Finding("heading", message + "or a yaw as a compass.", fix)]
+    if each.truth < 0:
+        message = (
+            f"The attitude of the {sketch.log.truth_kind} turns against the gyro: it takes the world's axes to the "
+        )
+        return [Finding("truth", message + "body's, and not the body's to the world's.")]
     if over:
         message = "The specific force points down in the body (mean f along −z): z is down in these axes, not up."
         return [Finding("imu", message, over)]
@@ -177,8 +187,8 @@ def _turned_over(sketch: Sketch, each: Hypothesis) -> str:
 
 def _said(each: Hypothesis) -> str:
     """Return a hypothesis in words."""
-    if each.heading < 0:
-        return "the heading is turned over"
+    if min(each.heading, each.truth) < 0:
+        return f"the {'heading' if each.heading < 0 else 'truth'} is turned over"
     if (each.A == each.G).all():
         axis = "xyz"[int(np.argmin(np.diag(each.A)))]
         return f"axis {axis} of both is negated, so the IMU is left-handed"
@@ -213,20 +223,20 @@ def _fixes(each: Hypothesis) -> list[str]:
 
 
 def scale_findings(
-    tilt: Relation, by_heading: Relation | None, by_truth: Relation | None, each: Hypothesis
+    tilt: Relation, by_heading: Relation | None, by_truth: Relation | None, up: int, heading_right: bool
 ) -> list[Finding]:
-    """Return what is wrong with the gyro's scale: two of tilt, heading and truth must agree on it."""
-    of_turn = each.A.T @ each.G
-    of_tilt = float(np.sign(np.linalg.det(each.A))) * of_turn
-    every = {
-        TILT: (tilt, of_tilt),
-        HEADING: (by_heading, each.heading * of_turn),
-        TRUTH: (by_truth, of_turn),
-    }
+    """Return what is wrong with the gyro's scale, its axes being right: two witnesses must agree on it.
+
+    Args:
+        tilt, by_heading, by_truth: what tilts and turns.
+        up: which axis of the IMU is about vertical.
+        heading_right: whether positions agree with a path by the heading.
+    """
+    every = {TILT: tilt, HEADING: by_heading, TRUTH: by_truth}
     slopes = {
-        name: relation.slope(Q)
-        for name, (relation, Q) in every.items()
-        if relation is not None and relation.n >= 10 and relation.correlation(Q) > KNOWN
+        name: relation.slope(ONE)
+        for name, relation in every.items()
+        if relation is not None and relation.n >= 10 and relation.correlation(ONE) > KNOWN
     }
     off = {name: slope for name, slope in slopes.items() if _is_off(slope, SCALE_MATTERS)}
     if not off:
@@ -236,9 +246,15 @@ def scale_findings(
     if list(off) == [HEADING] and abs(slopes[HEADING].value * DEGREE - 1) < UNIT_TOLERANCE and len(slopes) > 1:
         return [Finding("heading", message + ": degrees are read as radians.", "streams.heading.heading.unit: deg")]
     agreed = [a for a in off.values() if sum(abs(b.value / a.value - 1) < SCALE_MATTERS for b in off.values()) > 1]
-    if len(agreed) < len(slopes):
-        alone = slopes.get(HEADING) if len(off) == 1 and HEADING in off else None
-        if alone is None or not _is_off(alone, ALONE_MATTERS) or TRUTH in slopes:
+    turns = [slopes[name].value for name in (HEADING, TRUTH) if name in off]
+    if TILT not in off and HEADING in off and (len(agreed) > 1 or (heading_right and TRUTH not in slopes)):
+        scales = [f"{turns[0]:.4g}" if axis == up else "1" for axis in range(3)]
+        message += f": the scale of the gyro's {'xyz'[up]} axis, which is about vertical, is off."
+        return [Finding("imu", message, f"streams.imu.gyro.scale: [{', '.join(scales)}]")]
+    if list(slopes) == [TILT] and tilt.correlation(ONE) > SURE and _is_off(slopes[TILT], ALONE_MATTERS):
+        agreed = [slopes[TILT]]
+    elif len(agreed) < len(slopes) or len(agreed) < 2:
+        if list(off) != [HEADING] or TRUTH in slopes or not _is_off(off[HEADING], ALONE_MATTERS):
             return []  # motion, or a truth of its own, may feign it
         return [Finding("imu", message + ": the scale of the gyro's vertical axis, or that of the heading, is off.")]
     scale = float(np.average([e.value for e in agreed], weights=[1 / max(e.sigma, 1e-6) for e in agreed]))

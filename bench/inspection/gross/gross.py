@@ -10,12 +10,11 @@ import numpy as np
 
 from ....datasets.log import ImuStream, Log
 from ....datasets.quantities import DEGREE
-from ....datasets.state import Array, TimeArray
+from ....datasets.state import TimeArray
 from ..findings.advice import clock_fix
 from ..findings.finding import Check, Finding
-from ..streams.channels import seconds
 from ..streams.norms import NO_GRAVITY, check_norms
-from .axes import axes_findings, best, is_upright, scale_findings
+from .axes import CLEARLY, SURELY, agreement, axes_findings, best, hypotheses, is_upright, scale_findings
 from .plane import heading_fits, plane_findings
 from .relations import tilting, turning
 from .shifts import shift_of
@@ -83,13 +82,15 @@ def _findings(sketch: Sketch) -> list[Finding]:
     if np.median(np.linalg.norm(sketch.f_I, axis=1)) < NO_GRAVITY * WEAKEST:
         return []  # there is no up
     tilt = tilting(sketch)
-    heading, truth = sketch.heading, _truth_yaw(sketch)
+    heading, truth = sketch.heading, sketch.truth_yaw
     by_heading = None if heading is None else turning(sketch, *heading)
     by_truth = None if truth is None else turning(sketch, *truth)
     alike = best(sketch, tilt, by_heading, by_truth)
     findings = axes_findings(sketch, alike)
     if alike[0].is_none:
-        findings += _small_heading(sketch) or scale_findings(tilt, by_heading, by_truth, alike[0])
+        up = int(np.argmax(np.abs(sketch.up_I.mean(axis=0))))
+        vouched = by_truth is None and heading is not None and plane_findings(sketch, True)[1]
+        findings += _small_heading(sketch) or scale_findings(tilt, by_heading, by_truth, up, vouched)
         findings += [] if findings else _heading_clock(sketch)
     if findings or not is_upright(sketch):
         return findings
@@ -98,8 +99,31 @@ def _findings(sketch: Sketch) -> list[Finding]:
     suspects = {finding.stream for finding in in_plane}
     vouched = {"dvl"} if agrees else set()
     every = [*in_plane, *vertical_findings(sketch, suspects, vouched)]
+    every += [] if every else _imu_yaw(sketch, agrees)
     keys = [(finding.stream, _key(finding)) for finding in every]
     return [finding for k, finding in enumerate(every) if keys[k] not in keys[:k]]
+
+
+def _imu_yaw(sketch: Sketch, path_agrees: bool) -> list[Finding]:
+    """Find an IMU that is mounted a quarter or half a turn off about the vertical, by the motion of the DVL."""
+    motion, none = sketch.velocity, hypotheses()[0]
+    now = agreement(sketch, none)
+    if motion is None or now > CLEARLY:
+        return []
+    found = {}
+    for quarter in (1, 2, 3):
+        c, s = ((0, 1), (-1, 0), (0, -1))[quarter - 1]
+        v_B = motion[0] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        found[quarter] = agreement(sketch, none, v_B)
+    best = max(found, key=lambda quarter: found[quarter])
+    if found[best] < now + SURELY:
+        return []
+    turn = (-90 * best + 180) % 360 - 180
+    message = f"DVL and depth sensor agree with the accelerometers if the IMU is turned by {turn}° about the vertical"
+    if not path_agrees:
+        return [Finding("imu", message + ", or the DVL the other way.")]
+    message += ", while DVL and heading agree with the positions: the IMU's yaw on the vehicle."
+    return [Finding("imu", message, f"streams.imu.mounting.yaw_deg: {turn}  # added to the one there")]
 
 
 def _small_heading(sketch: Sketch) -> list[Finding]:
@@ -112,20 +136,6 @@ def _small_heading(sketch: Sketch) -> list[Finding]:
         "degrees."
     )
     return [Finding("heading", message, "streams.heading.heading.unit: rad")]
-
-
-def _truth_yaw(sketch: Sketch) -> tuple[Array, Array, Array] | None:
-    """Return when (m,) s, the yaw (m,) rad by the truth, and where it is known (n,); None without an attitude."""
-    truth = sketch.log.truth
-    if truth is None or len(truth) < 30:
-        return None
-    every = slice(None, None, max(len(truth) // 4000, 1))
-    R, t_s = truth.R_WB[every], seconds(sketch.log, truth.t_ns[every])
-    known = np.isfinite(R[:, 0, 0])
-    if np.count_nonzero(known) < 30:
-        return None
-    t_s, yaw = t_s[known], np.unwrap(np.arctan2(R[known, 1, 0], R[known, 0, 0]))
-    return t_s, yaw, sketch.heard(t_s)
 
 
 def _heading_clock(sketch: Sketch) -> list[Finding]:

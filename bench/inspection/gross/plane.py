@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from ..streams.channels import seconds
 from .axes import CLEARLY, agreement, hypotheses
 from .shifts import LONGEST_S
 from .sketch import Sketch
+from .vertical import climb_scale
 
 MOST_FIXES = 300
 """Positions used: more do not change a gross fault."""
@@ -43,6 +44,8 @@ SQUARE = 20 * DEGREE
 """A turn this near to a right angle is taken for one."""
 NEARLY_DEG = 5.0
 """A DVL's yaw this near to a right angle is one: a path shows its direction to a degree or two."""
+STEADY = 0.9
+"""Least length of the mean of e^{i difference} of two yaws, for their mean difference to be an offset."""
 SILENT_SHARE = 0.1
 """Of the time between the first and the last fix: with the DVL silent for longer, the path is not known."""
 FAR_M = 100e3
@@ -232,14 +235,14 @@ def _of_fixes(
     """Return what is wrong between the path and one source of positions; `agrees`: another source fits the path."""
     log, fits = sketch.log, now.rms_m <= fixes.allowed_m
     if not (fits and _is_plain(now, course.compass)):
-        other = _other_coordinates(log, course, path, fixes, now, turns_right)
+        other = _other_coordinates(sketch, course, path, fixes, now, turns_right)
         if other is not None:
             return [other]
     late = _clock(sketch, course, path, fixes, now) or (_heard_under_water(sketch, fixes) if not agrees else None)
     if late is not None:
         return [late]
     if now.rms_m > max(FAR_OFF * fixes.extent_m, 2 * NOISES * fixes.sigma_m) and course.compass:
-        return [_far_off(log, fixes, now)]
+        return [_in_earth_axes(sketch, course, fixes, now) or _far_off(log, fixes, now)]
     if not fits or _is_plain(now, course.compass):
         return []
     if not agrees:
@@ -259,10 +262,10 @@ def _is_plain(match: Match, compass: bool) -> bool:
 
 
 def _other_coordinates(
-    log: Log, course: Course, path: list[Plane], fixes: Fixes, now: Match, turns_right: bool
+    sketch: Sketch, course: Course, path: list[Plane], fixes: Fixes, now: Match, turns_right: bool
 ) -> Finding | None:
     """Return exchanged or mirrored coordinates, if the path then fits far better, or as well without a turn."""
-    mirrored = course.match(path, fixes, p=fixes.p.conj())
+    log, mirrored = sketch.log, course.match(path, fixes, p=fixes.p.conj())
     exchanged = _unexchanged(log, fixes)
     straight = None if exchanged is None else course.match(path, fixes, p=exchanged)
     if straight is not None and _explains(straight, now, fixes) and straight.rms_m < mirrored.rms_m:
@@ -270,7 +273,9 @@ def _other_coordinates(
     if _explains(mirrored, now, fixes):
         return _mirrored(log, fixes, now, mirrored, course.compass and turns_right)
     others = [each for each in (mirrored, straight) if each is not None and each.rms_m < now.rms_m / BETTER]
-    if others and now.rms_m < fixes.allowed_m and course.compass:
+    turn = float(np.angle(now.z))
+    only_turned = abs(turn) > TURN_MATTERS and abs(abs(now.z) - 1) < SCALE_MATTERS and _off_the_truth(sketch) is None
+    if others and now.rms_m < fixes.allowed_m and course.compass and only_turned:
         return _ambiguous(log, fixes, now)
     return None
 
@@ -358,6 +363,23 @@ def _mirrored(log: Log, fixes: Fixes, now: Match, then: Match, decided: bool) ->
     return Finding(fixes.stream, message)
 
 
+def _in_earth_axes(sketch: Sketch, course: Course, fixes: Fixes, now: Match) -> Finding | None:
+    """Find a DVL's velocity that is along east and north, or north and east, already."""
+    assert sketch.velocity is not None
+    v = sketch.velocity[0][:, 0] + 1j * sketch.velocity[0][:, 1]
+    path = replace(course, v=v, yaw=np.zeros(len(v))).path()
+    fits = [course.match(path, fixes, p=p) for p in (fixes.p, fixes.p.conj())]
+    best = min(fits, key=lambda match: match.rms_m)
+    if best.rms_m > min(BETTER * now.rms_m, fixes.allowed_m):
+        return None
+    message = (
+        f"The path by DVL and heading is {now.rms_m:.3g} m (rms) off the {_whose(sketch.log, fixes)}'s positions, and "
+        f"{best.rms_m:.2g} m if the DVL's velocity is not turned by the heading: it is along the Earth's axes, and not "
+        "the body's."
+    )
+    return Finding("dvl", message)
+
+
 def _far_off(log: Log, fixes: Fixes, now: Match) -> Finding:
     message = (
         f"The {_whose(log, fixes)}'s positions are {now.rms_m:.3g} m (rms) off the path by DVL and heading, however "
@@ -416,6 +438,10 @@ def _size_and_turn(sketch: Sketch, course: Course, fixes: Fixes, now: Match) -> 
         guess = f" That is the ratio of {near[0]} to what is stated." if near else ""
         message = f"The DVL's path must be scaled by {size:.4g} to be as long as the {whose}'s.{guess}"
         fix = f"streams.dvl.velocity.unit: {near[0]}" if near else f"streams.dvl.velocity.scale: {size:.4g}"
+        climb = climb_scale(sketch)
+        if not near and climb is not None and abs(climb / size - 1) > 2 * SCALE_MATTERS:
+            message += f" By the depth sensor its climb needs {climb:.3g}: other axes, or speeds along beams."
+            fix = ""
         return [Finding("dvl", message, fix)]
     turn = float(np.angle(now.z))
     if not course.compass or abs(turn) < TURN_MATTERS:
@@ -445,7 +471,23 @@ def turned(sketch: Sketch, turn: float) -> str:
     motion = sketch.velocity
     if motion is None:
         return ""
+    offset = _off_the_truth(sketch)
+    if offset is not None:
+        both = abs(np.angle(np.exp(1j * (offset + turn)))), abs(offset)
+        return ("heading", "dvl")[int(np.argmin(both))] if min(both) < TURN_MATTERS / 2 else ""
     c, s = np.cos(turn), np.sin(turn)
     v_B = motion[0] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
     as_is, then = (agreement(sketch, hypotheses()[0], v) for v in (motion[0], v_B))
     return "dvl" if then > as_is + CLEARLY else "heading" if as_is > then + CLEARLY else ""
+
+
+def _off_the_truth(sketch: Sketch) -> float | None:
+    """Return the heading's yaw less the truth's (rad, on average); None where either is unknown, or they differ."""
+    truth, found = sketch.truth_yaw, course_of(sketch)
+    if truth is None or found is None:
+        return None
+    t_s, yaw, heard = truth
+    if np.count_nonzero(heard) < FEWEST:
+        return None
+    mean = np.mean(np.exp(1j * (found[0].yaw - sketch.on_grid(t_s, yaw))[heard]))
+    return float(np.angle(mean)) if abs(mean) > STEADY else None

@@ -18,6 +18,8 @@ MOST_CELLS = 2000
 """Rows of the grid at most, so that a check takes milliseconds; it is 1.8 s fine in an hour."""
 FEWEST_CELLS = 20
 """In ten seconds a vehicle hardly turns, and nothing is compared."""
+MOST_POSES = 4000
+"""Poses of the truth used: two for each cell of the grid."""
 LEVEL_S = 2.0
 """The accelerometers are averaged over this for the level, as in `inertial`."""
 FASTER, SLOW_M_S = 4.0, 0.5
@@ -99,6 +101,19 @@ class Sketch:
             return None
         t_s = seconds(self.log, heading.t_ns)
         return t_s, np.unwrap(heading.psi), self.heard(t_s)
+
+    @cached_property
+    def truth_yaw(self) -> tuple[Array, Array, Array] | None:
+        """When (m,) s, the yaw (m,) rad by the truth, and where it is known (n,); None without an attitude."""
+        truth = self.log.truth
+        if truth is None or len(truth) < 30:
+            return None
+        every = slice(None, None, max(len(truth) // MOST_POSES, 1))
+        R, t_s = truth.R_WB[every], seconds(self.log, truth.t_ns[every])
+        known = np.isfinite(R[:, 0, 0])
+        if np.count_nonzero(known) < 30:
+            return None
+        return t_s[known], np.unwrap(np.arctan2(R[known, 1, 0], R[known, 0, 0])), self.heard(t_s[known])
 
     def level_velocity(self, v_B: Array) -> tuple[Plane, Array]:
         """Return (n,) the velocity in the level frame of yaw zero, forward + i left, and its vertical part (n,)."""

@@ -114,6 +114,15 @@ def vertical_findings(sketch: Sketch, suspects: set[str], vouched: set[str]) -> 
     return [_finding(log, name, other, slope if pair[0] == name else _inverse(slope))]
 
 
+def climb_scale(sketch: Sketch) -> float | None:
+    """Return by what the DVL's climb must be scaled to be the depth sensor's; None where that does not show."""
+    heights = _heights(sketch)
+    if not {"depth", "dvl"} <= heights.keys():
+        return None
+    slope = _slope(sketch, heights["depth"], heights["dvl"])
+    return slope.value if slope is not None and abs(slope.correlation) > ALIKE else None
+
+
 def _in_the_air(log: Log) -> bool:
     assert log.depth is not None
     return float(np.median(log.depth.z)) > IN_THE_AIR_M + 3 * float(np.median(log.depth.sigma))

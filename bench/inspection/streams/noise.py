@@ -119,5 +119,4 @@ def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
     fix = f"{channel.sigma_key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
     if not large:
         message += " The stated one is right only if most of the error is slow, which this check cannot see."
-        fix += "  # if its errors are white"
-    return [Finding(channel.stream, message, fix)]
+    return [Finding(channel.stream, message, fix, "" if large else "only if its errors are white")]
