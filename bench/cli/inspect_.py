@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import Data
+from .options import Data, Repair
 
 if TYPE_CHECKING:
     from ...datasets.formats.recording import Recording
@@ -23,6 +23,7 @@ def inspect(
         ),
     ],
     data: Data = None,
+    repair: Repair = False,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -41,7 +42,7 @@ def inspect(
 
     from ...datasets.errors import shown
     from ..inspection.contents import print_contents
-    from ..inspection.inspecting import inspect_log, open_to_inspect
+    from ..inspection.inspecting import description_of, inspect_log, open_to_inspect
     from ..inspection.page import page_file, print_inspection, save_page
     from ..output.tables.terminal import console
 
@@ -53,8 +54,8 @@ def inspect(
         return
     page_file(out, "")  # refuses before anything is read
     with Console(stderr=True).status(f"inspecting {log}") as status:
-        opened, repairs = open_to_inspect(log, data)
-        inspection = inspect_log(opened, repairs)
+        opened, repairs = open_to_inspect(log, data, repair=repair)
+        inspection = inspect_log(opened, repairs, description_of(log, data))
         file = page_file(out, opened.name)
         status.update(f"drawing {file}")
         save_page(inspection, file)

@@ -25,6 +25,12 @@ def run(
     ] = None,
     repair: Repair = False,
     force: Annotated[bool, typer.Option("--force", help="Repeat runs that are already finished.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Run nothing if something looks grossly wrong in a recorded log.")
+    ] = False,
+    no_check: Annotated[
+        bool, typer.Option("--no-check", help="Do not look for gross faults in recorded logs first.")
+    ] = False,
     dask: Annotated[
         str | None,
         typer.Option(
@@ -37,7 +43,8 @@ def run(
     """Run an experiment and print its tables.
 
     Every estimator of EXPERIMENT runs on each of its logs. Finished runs are kept. They are repeated only if their
-    spec, their log or a version has changed.
+    spec, their log or a version has changed. Recorded logs are first checked for gross faults: gravity, units, axes,
+    clocks, coordinates. What is found is printed and kept with the runs.
     """
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
@@ -52,7 +59,9 @@ def run(
         printed.update(rows["log"])
 
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
-        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, print_finished)
+        outcome = sweep(
+            plan, data, out, jobs, only, repair, force, dask, print_finished, check=not no_check, strict=strict
+        )
     present(outcome, plan, folder, printed)
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run

@@ -21,10 +21,12 @@ from ...datasets.described.opening import RecordingNotFound
 from ..errors import ExperimentError
 from ..experiment.plan import Experiment, Run
 from ..files import writing
+from ..inspection.findings.finding import Finding
 from ..results.identity import content_sha256
 from ..results.store import Row, Store, provenance, sole_writer
 from .cold_start import compile_first
 from .dask_pool import run_on_cluster
+from .log_check import Findings, check_log, note_of, report
 from .pool import run_all
 from .task import Task
 
@@ -61,9 +63,11 @@ def run_experiment(
     repair: bool = False,
     force: bool = False,
     dask: str | None = None,
+    check: bool = True,
+    strict: bool = False,
 ) -> pd.DataFrame:
     """Run every estimator on every log and return the rows of the store, one per run and output; see `sweep`."""
-    return sweep(experiment, data, out, jobs, only, repair, force, dask).rows
+    return sweep(experiment, data, out, jobs, only, repair, force, dask, check=check, strict=strict).rows
 
 
 def sweep(
@@ -76,6 +80,8 @@ def sweep(
     force: bool = False,
     dask: str | None = None,
     finished_log: Callable[[pd.DataFrame], None] | None = None,
+    check: bool = True,
+    strict: bool = False,
 ) -> Outcome:
     """Run what the store lacks, and return its rows.
 
@@ -93,19 +99,25 @@ def sweep(
         force: repeat runs that are in the store already.
         dask: address of a Dask scheduler, its scheduler file, or "local", see `dask_pool`; else worker processes here.
         finished_log: called with the rows of a log as soon as the last of its runs has ended.
+        check: look for gross faults in recorded logs before anything runs. They are said on standard error, and are
+            among the notes of the log's rows.
+        strict: refuse to run if the check finds any.
 
     Raises:
         ExperimentError, EstimatorError, DatasetError: nothing was run.
     """
     if not isinstance(experiment, Experiment):
         experiment = Experiment.load(experiment)
+    if strict and not check:
+        raise ExperimentError("--strict refuses what the check finds, and --no-check leaves the check out")
     if jobs < 0:
         raise ExperimentError(f"jobs must be 0 (one per core) or more, found {jobs}")
     folder = Path(out) / experiment.name
     runs = _select(experiment, only)
-    tasks, absent, duration_s = _opened(
-        [Task.of(experiment, run, Path(data) if data else None, repair) for run in runs]
+    tasks, absent, duration_s, findings = _opened(
+        [Task.of(experiment, run, Path(data) if data else None, repair) for run in runs], check
     )
+    report(findings, strict, _say)
     _make_room(folder)
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
@@ -203,11 +215,13 @@ def _select(experiment: Experiment, only: str | None) -> list[Run]:
     return chosen
 
 
-def _opened(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]], dict[str, float]]:
+def _opened(tasks: Sequence[Task], check: bool) -> tuple[list[Task], list[dict[str, Any]], dict[str, float], Findings]:
     """Open each recorded log once, so that bad input is refused before any run begins.
 
-    Returns the tasks whose log is here, a row for each of the others, and how long each log is, s.
+    Returns the tasks whose log is here, a row for each of the others, how long each log is (s), and what the check of
+    each recorded log found.
     """
+    findings: dict[str, Sequence[Finding]] = {}
     duration_s: dict[str, float] = {}
     readings: dict[str, str] = {}
     missing: dict[str, str] = {}
@@ -217,6 +231,9 @@ def _opened(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]], di
             if spec.duration_s is None:
                 log = spec.open(None, task.data, task.repair)
                 duration_s[spec.name], readings[spec.name] = log.duration_s, content_sha256(log)
+                assert spec.log is not None
+                if check and (found := check_log(log, spec.log, task.data)):
+                    findings[spec.name] = found
             else:
                 duration_s[spec.name] = spec.duration_s
                 if (path := spec.path_sha256) is not None:
@@ -224,12 +241,17 @@ def _opened(tasks: Sequence[Task]) -> tuple[list[Task], list[dict[str, Any]], di
         except RecordingNotFound as error:
             missing[spec.name] = f"not here: {error}"
     here = [
-        replace(task, readings_sha256=readings.get(task.run.log.name))
+        replace(task, readings_sha256=readings.get(name), checked=tuple(map(note_of, findings.get(name, ()))))
         for task in tasks
-        if task.run.log.name in duration_s
+        if (name := task.run.log.name) in duration_s
     ]
     absent = [task.row("absent", missing[task.run.log.name]) for task in tasks if task.run.log.name in missing]
-    return here, absent, duration_s
+    return here, absent, duration_s, findings
+
+
+def _say(message: str) -> None:
+    """Print a line on standard error."""
+    Console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
 
 
 def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:

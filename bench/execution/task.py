@@ -35,6 +35,7 @@ class Task:
         lags_s: those of all estimators of the experiment, whose floors are found together.
         data: where recorded logs are.
         repair: let loaders drop bad rows.
+        checked: what the check before the experiment found in the log, as notes.
         readings_sha256: of a recorded log, or of a simulated one's recorded path; see `identity.identity`.
     """
 
@@ -48,6 +49,7 @@ class Task:
     data: Path | None = None
     repair: bool = False
     readings_sha256: str | None = None
+    checked: tuple[str, ...] = ()
 
     @staticmethod
     def of(experiment: Experiment, run: Run, data: Path | None = None, repair: bool = False) -> Task:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...datasets.errors import DatasetError, one_line
 from ...datasets.log import Log
-from ...datasets.notes import as_data
+from ...datasets.notes import Note, as_data
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
 from ..experiment.plan import plain
@@ -127,13 +127,14 @@ class WorkerCache:
         """Score a run: one row per output, and its trajectories beside them."""
         scoring = task.scoring
         files: dict[str, bytes] = {}
+        checked = [Note(text, "check", text.partition(":")[0]) for text in task.checked]
         shared = {
             "failed_at_s": result.failed_at_s,
             "truth_kind": log.truth_kind if log.truth is not None else None,
             "duration_s": result.duration_s,
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
-            "notes": json.dumps([as_data(note) for note in (*log.notes, *result.notes)]),
+            "notes": json.dumps([as_data(note) for note in (*log.notes, *checked, *result.notes)]),
             **costs(result),
             **extra,
         }

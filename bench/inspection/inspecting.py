@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ...datasets.described.opening import RecordingNotFound, open_log
+from ...datasets.described.description import Description, read_description
+from ...datasets.described.opening import RecordingNotFound, find_log, open_log
 from ...datasets.errors import DatasetError
 from ...datasets.log import Log
+from .findings.advice import resolved
 from .findings.finding import Check, Finding
+from .gross.gross import gross_check, unsaid
 from .streams.imu_noise import check_imu_noise
 from .streams.noise import check_noise
 from .streams.norms import check_norms
@@ -54,19 +58,26 @@ class Inspection:
         return tuple(finding for check in self.checks for finding in check.findings)
 
 
-def open_to_inspect(name: str | Path, data: Path | None = None) -> tuple[Log, tuple[str, ...]]:
-    """Open a log, with repair only if it does not open without; return it and the notes of what was repaired.
+def description_of(name: str | Path, data: Path | None = None) -> Description:
+    """Return the description of a log that `open_to_inspect` opens."""
+    return read_description(find_log(name, data)[0])
+
+
+def open_to_inspect(name: str | Path, data: Path | None = None, *, repair: bool = False) -> tuple[Log, tuple[str, ...]]:
+    """Open a log, with repair if it is asked for, or does not open without; return it and the notes of the repairs.
 
     Raises:
         DatasetError: it does not open even with repair.
     """
     try:
-        log, repairs = open_log(name, data), ()
+        log = open_log(name, data, repair=repair)
     except RecordingNotFound:
         raise
     except DatasetError:
-        log = open_log(name, data, repair=True)
-        repairs = tuple(note for note in log.notes if REPAIRED.match(note))
+        if repair:
+            raise
+        log, repair = open_log(name, data, repair=True), True
+    repairs = tuple(note for note in log.notes if REPAIRED.match(note)) if repair else ()
     _check_sizes(name, log)
     return log, repairs
 
@@ -96,12 +107,32 @@ def _check_sizes(name: str | Path, log: Log) -> None:
                 )
 
 
-def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Inspection:
-    """Run every check on a log; `repairs` are the notes of the rows that opening it had to drop."""
+def inspect_log(log: Log, repairs: Sequence[str] = (), description: Description | None = None) -> Inspection:
+    """Run every check on a log.
+
+    Streams in which a gross fault is found are left out of the finer comparisons, which would blame others for it.
+
+    Args:
+        log: the log.
+        repairs: the notes of the rows that opening it had to drop.
+        description: its log.yaml. Fixes are then absolute lines for it, which make a valid log.yaml.
+    """
     from .between.cross_checks import cross_checks
 
-    checks = [check(log) for check in SINGLE]
-    return Inspection(log, (_check_repairs(log, repairs), *checks, *cross_checks(log)))
+    checks = [_check_repairs(log, repairs), *(check(log) for check in SINGLE)]
+    gross = gross_check(log)
+    gross = replace(gross, findings=unsaid([f for check in checks for f in check.findings], gross.findings))
+    faulty = {finding.stream for finding in gross.findings}
+    checks += [gross, *([] if "imu" in faulty else cross_checks(_without(log, faulty)))]
+    if description is not None:
+        checks = [replace(c, findings=tuple(resolved(f, description) for f in c.findings)) for c in checks]
+    return Inspection(log, tuple(checks))
+
+
+def _without(log: Log, streams: set[str]) -> Log:
+    """Return the log without some streams."""
+    absent: dict[str, Any] = dict.fromkeys(streams)
+    return replace(log, **absent) if absent else log
 
 
 def _check_repairs(log: Log, repairs: Sequence[str]) -> Check:
@@ -111,8 +142,8 @@ def _check_repairs(log: Log, repairs: Sequence[str]) -> Check:
         match = REPAIRED.match(note)
         if match is not None:
             stream, count, what = match.groups()
-            fix = FIXES.get(what, "").format(stream)
-            findings.append(Finding(stream, f"{count} {stream} rows are {what}; they were left out here.", fix))
+            hint = FIXES.get(what, "").format(stream)
+            findings.append(Finding(stream, f"{count} {stream} rows are {what}; they were left out here.", hint=hint))
     duration = f"{log.duration_s:.1f} s"
     streams = ", ".join(["imu", *log.streams, *([log.truth_kind] if log.truth is not None else [])])
     dropped = "; ".join(note for note in log.notes if note.endswith("dropped"))

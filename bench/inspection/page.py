@@ -49,7 +49,10 @@ def print_inspection(inspection: Inspection, console: Console) -> None:
     for number, finding in enumerate(inspection.findings, start=1):
         table.add_row(Text(f"{number}."), Text(finding.message))
         if finding.fix:
-            table.add_row("", Text(f"→ log.yaml: {finding.fix}", style="cyan"))
+            for line in finding.fix.split("\n"):
+                table.add_row("", Text(f"→ log.yaml: {line}", style="cyan"))
+        if finding.hint:
+            table.add_row("", Text(f"→ {finding.hint}", style="cyan"))
     console.print(Padding(table, (0, 0, 0, 1), expand=False))
 
 

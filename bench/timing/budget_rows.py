@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets import Log, Scenario, simulate
+from ...datasets import Log, Scenario, open_log, simulate
 from ...datasets.described.folder import write_folder
 from ...datasets.epochs import cut
 from ...estimators import create
@@ -24,6 +24,7 @@ from ..execution.pool import run_all
 from ..execution.result import Result
 from ..execution.task import Task
 from ..experiment.plan import Experiment
+from ..inspection.gross.gross import quick_findings
 from ..metrics import ate
 from ..metrics.scoring import scores
 from . import evo
@@ -135,6 +136,22 @@ def simulation_against_filter() -> Measured:
     return Measured(take_turns(partial(_mission, 600.0), partial(run_log, log, estimator), 5))
 
 
+def check_against_run() -> Measured:
+    """Measure the check before an experiment over a run of `eskf`, from the ten minutes on disk to the scores."""
+    estimator = create("eskf")
+    warm_up(estimator)
+    with TemporaryDirectory() as temporary:
+        folder = write_folder(_simulated(600.0), Path(temporary) / "ten")
+
+        def run() -> None:
+            log = open_log(folder)
+            result = run_log(log, estimator)
+            assert result.online is not None
+            scores(log, result.online)
+
+        return Measured(take_turns(partial(quick_findings, open_log(folder)), run, 5))
+
+
 def two_workers_against_one() -> Measured:
     """Measure the rate of two worker processes over that of one, on 100 runs, the workers being warm."""
     experiment = Experiment.from_dict(plan_of(60.0, RUNS + WARM_RUNS))
@@ -230,6 +247,7 @@ BUDGETS: Sequence[Budget] = (
     Budget("eskf's run in a worker over its work, 20 s", 2.5, False, partial(whole_run, 20.0)),
     Budget("eskf's run in a worker over its work, 10 min", 1.3, False, partial(whole_run, 600.0)),
     Budget("harness over eskf's steps, 10 min", 0.5, False, harness_against_steps),
+    Budget("check before an experiment over eskf's run, 10 min", 0.05, False, check_against_run),
     Budget("evo over ATE and RPE, 100,000 poses", 100.0, True, scores_against_evo),
     Budget("simulate over eskf, 10 min", 2.0, False, simulation_against_filter),
     Budget("two workers over one, 100 runs", 1.8, True, two_workers_against_one),

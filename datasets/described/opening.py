@@ -40,27 +40,30 @@ def open_log(name_or_folder: str | Path, data: str | Path | None = None, *, repa
         RecordingNotFound: the catalog entry is known, its recording is missing.
         DatasetError: anything else, naming what, where, and the nearest known name.
     """
-    path = Path(name_or_folder)
-    root = _recordings(data)
     try:
-        with also_in(root):
-            if (path / "log.yaml").is_file():
-                return build_log(read_description(path / "log.yaml"), path, repair=repair)
-            if path.suffix == ".yaml" and path.is_file():
-                folder = path.parent if data is None else Path(data)
-                return build_log(read_description(path), folder, repair=repair)
-            if root is not None and (root / path / "log.yaml").is_file():
-                return build_log(read_description(root / path / "log.yaml"), root / path, repair=repair)
-            if str(name_or_folder) in catalog_names():
-                return _open_catalogued(str(name_or_folder), data, repair=repair)
-            is_folder = path.is_dir()
-            if is_folder and path.resolve().name in catalog_names():  # the recording's own folder
-                return build_log(read_description(CATALOG / f"{path.resolve().name}.yaml"), path, repair=repair)
+        file, folder = find_log(name_or_folder, data)
+        with also_in(_recordings(data)):
+            return build_log(read_description(file), folder, repair=repair)
     except (OSError, ValueError) as error:
         if isinstance(error, DatasetError):
             raise
         raise DatasetError(f"{name_or_folder}: cannot be opened: {error}") from None
-    if is_folder:
+
+
+def find_log(name_or_folder: str | Path, data: str | Path | None = None) -> tuple[Path, Path]:
+    """Return a log's description (.yaml) and the folder of its files; arguments and errors are those of `open_log`."""
+    path, root = Path(name_or_folder), _recordings(data)
+    if (path / "log.yaml").is_file():
+        return path / "log.yaml", path
+    if path.suffix == ".yaml" and path.is_file():
+        return path, path.parent if data is None else Path(data)
+    if root is not None and (root / path / "log.yaml").is_file():
+        return root / path / "log.yaml", root / path
+    if str(name_or_folder) in catalog_names():
+        return _catalogued(str(name_or_folder), data)
+    if path.is_dir():
+        if path.resolve().name in catalog_names():  # the recording's own folder
+            return CATALOG / f"{path.resolve().name}.yaml", path
         raise DatasetError(
             f"{path}: no log.yaml in this folder; it describes the files (see fathom.datasets.described.description)"
         )
@@ -78,7 +81,7 @@ def _recordings(data: str | Path | None) -> Path | None:
     return None if root is None else Path(root)
 
 
-def _open_catalogued(name: str, data: str | Path | None, *, repair: bool) -> Log:
+def _catalogued(name: str, data: str | Path | None) -> tuple[Path, Path]:
     root = _recordings(data)
     if root is None:
         raise RecordingNotFound(f"{name}: the folder of recordings is not set; use --data DIR or set FATHOM_DATA")
@@ -88,4 +91,4 @@ def _open_catalogued(name: str, data: str | Path | None, *, repair: bool) -> Log
         raise RecordingNotFound(
             f"{name}: no folder {folder} ({whence}); point --data or FATHOM_DATA at its parent folder"
         )
-    return build_log(read_description(CATALOG / f"{name}.yaml"), folder, repair=repair)
+    return CATALOG / f"{name}.yaml", folder

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from ....datasets.log import Log
+from ..findings.advice import clock_fix
 from ..findings.finding import Check, Finding
+from ..findings.fitting import FALSE_ALARM, Estimate
 from ..streams.channels import seconds
-from .fitting import FALSE_ALARM, Estimate
 from .pair_check import Delay
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def clock_check(log: Log, delays: Sequence[Delay]) -> Check:
             f"Every other stream is {_late(common)} by the IMU's clock, and the others agree with each other: the "
             "IMU's clock is wrong."
         )
-        findings.append(Finding("imu", message, fix("imu", common.times(-1))))
+        findings.append(Finding("imu", message, clock_fix("imu", -common.value)))
     else:
         findings += [_finding(name, off[name]) for name in off if name not in PARTS]
         findings += _truth_findings(log, {n: e for n, e in story.late.items() if n in PARTS}, set(off))
@@ -125,19 +126,11 @@ def _late(by: Estimate) -> str:
     return f"{Estimate(abs(by.value), by.sigma).text('s')} {'late' if by.value > 0 else 'early'}"
 
 
-def fix(stream: str, late: Estimate) -> str:
-    """Return the key that brings a stream onto the IMU's clock."""
-    path = "truth" if stream == "truth" else f"streams.{stream}"
-    if late.value > 0 and stream not in ("imu", "truth"):
-        return f"{path}.time.delay_s: {late.value:.3f}"
-    return f"{path}.time.clock_offset_s: {-late.value:.3f}"
-
-
 def _finding(name: str, late: Estimate) -> Finding:
     message = f"The stamps of {name} are {_late(late)} by the IMU's clock."
     if late.value > 0:
         message += f" Where `time.received` is a column: `time.clock_offset_s: {-late.value:.3f}`."
-    return Finding(name, message, fix(name, late))
+    return Finding(name, message, clock_fix(name, late.value))
 
 
 def _truth_findings(log: Log, parts: dict[str, Estimate], off: set[str]) -> list[Finding]:
@@ -146,7 +139,8 @@ def _truth_findings(log: Log, parts: dict[str, Estimate], off: set[str]) -> list
     whose = log.truth_kind
     common = _common(parts)
     if common is not None:
-        return [Finding("truth", f"The {whose} is {_late(common)} by the IMU's clock.", fix("truth", common))]
+        message = f"The {whose} is {_late(common)} by the IMU's clock."
+        return [Finding("truth", message, clock_fix("truth", common.value))]
     listed = ", ".join(f"{name.split()[1]} {_late(late)}" for name, late in parts.items())
     return [Finding("truth", f"The parts of the {whose} have different delays by the IMU's clock: {listed}.")]
 

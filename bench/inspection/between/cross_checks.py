@@ -36,9 +36,14 @@ def cross_checks(log: Log) -> list[Check]:
         if (mirrored := mirrored_dvl(log, imu)) is not None:
             answer, log = mirrored  # the other checks use the corrected axes
             answers.append(answer)
-        answers += [dvl_against_positions(log, imu, where) for where in positions(log, imu)]
-        if reference is not None:
-            answers.append(dvl_against_truth(log, imu, reference))
+        of_truth = None if reference is None else dvl_against_truth(log, imu, reference)
+        elsewhere = of_truth is not None and any(finding.stream == "truth" for finding in of_truth.check.findings)
+        for where in positions(log, imu):
+            answer = dvl_against_positions(log, imu, where)
+            if answer is not None and elsewhere and where.whose == log.truth_kind:
+                answer = PairCheck(answer.check)  # the truth's lever arm looks like delays there
+            answers.append(answer)
+        answers.append(of_truth)
         answers.append(imu_against_dvl(log, imu))
     if reference is not None:
         answers += [gps_against_truth(log, reference), depth_against_truth(log, reference), truth_against_itself(log)]

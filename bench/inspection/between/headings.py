@@ -12,8 +12,7 @@ from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from ..streams.channels import seconds
-from .fitting import (
+from ..findings.fitting import (
     BLOCKS,
     Estimate,
     Fit,
@@ -26,6 +25,7 @@ from .fitting import (
     windows_of,
     without_trend,
 )
+from ..streams.channels import seconds
 from .inertial import LEVEL_S, Inertial, headings
 from .pair_check import Delay, PairCheck
 from .path_fit import fit_path, positions

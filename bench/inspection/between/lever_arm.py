@@ -18,7 +18,7 @@ from ....datasets.log import DvlStream, Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
-from .fitting import BLOCKS, Estimate, Fit, Index, blocks_of_windows, least_squares, windows_of, without_trend
+from ..findings.fitting import BLOCKS, Estimate, Fit, Index, blocks_of_windows, least_squares, windows_of, without_trend
 from .headings import mounting_text
 from .inertial import Inertial, cross
 from .pair_check import Delay, PairCheck

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..findings.finding import Check
-from .fitting import Estimate
+from ..findings.fitting import Estimate
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,19 @@ import numpy as np
 
 from ....datasets.log import Log
 from ....datasets.state import Array
+from ..findings.fitting import (
+    BLOCKS,
+    Estimate,
+    Fit,
+    Index,
+    Mask,
+    Plane,
+    blocks_of_windows,
+    least_squares,
+    stacked,
+    without_trend,
+)
 from ..streams.channels import seconds
-from .fitting import BLOCKS, Estimate, Fit, Index, Mask, Plane, blocks_of_windows, least_squares, stacked, without_trend
 from .inertial import Inertial, yaw_by_heading
 
 POSITION_PERIOD_S = 0.5

@@ -13,8 +13,8 @@ from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
 from ..findings.finding import Check, Finding
+from ..findings.fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
 from ..streams.channels import seconds
-from .fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
 from .inertial import Inertial, cross
 from .pair_check import Delay, PairCheck
 from .path_fit import velocities
@@ -33,7 +33,10 @@ SPEED_MATTERS_M_S = 0.05
 """A DVL's bias is 1 % of its speed at worst, and 5 cm/s is more than that at 4 m/s."""
 TURN_MATTERS = 1.0 * DEGREE
 """rad: mountings are measured to about a degree."""
+ARM_M = 0.3
+"""At 0.1 rad/s an arm that is off by this makes 3 cm/s, most of an error of velocity; positions are off by as much."""
 AXES = ("east", "north", "up")
+AWAY = (("forward", "x"), ("left", "y"), ("up", "z"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +288,14 @@ def dvl_against_truth(log: Log, imu: Inertial, reference: Reference) -> PairChec
     ]
     said = [e.text("m") if e is not None and e.known_to(0.5) else "not observable" for e in arm]
     facts[f"lever arm of the DVL from the {whose}'s point"] = "forward " + ", left ".join(said[:2]) + f", up {said[2]}"
+    away = [a for a, e in zip(AWAY, arm, strict=True) if e is not None and e.known_to(0.5) and e.differs(0.0, ARM_M)]
+    if away and not findings:
+        listed = ", ".join(f"{said['xyz'.index(axis)]} {name}" for name, axis in away)
+        message = (
+            f"The DVL is {listed} of the point whose positions and velocities the {whose} gives: the lever arm of the "
+            f"{whose} is not taken into account."
+        )
+        findings.append(Finding("truth", message, hint=f"move the {whose} to the DVL's place before it is used"))
     delays = (Delay("dvl", "truth velocity", delay),) if delay.known_to(0.5) else ()
 
     def draw(axes: Axes) -> None:

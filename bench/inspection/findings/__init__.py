@@ -1,1 +1,1 @@
-"""The result of a check: measured facts, findings with their fix, and a panel for the page."""
+"""The result of a check: measured facts with their uncertainty, findings with their fix, and a panel for the page."""

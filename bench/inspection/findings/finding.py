@@ -17,12 +17,15 @@ class Finding:
     Attributes:
         stream: the stream concerned, by its name in log.yaml: "imu", "dvl", "truth".
         message: one sentence with its figures.
-        fix: what to put into log.yaml, by its path ("streams.dvl.time.delay_s: 0.5"); "" where no key helps.
+        fix: what to put into log.yaml, a line for each key, by its path ("streams.dvl.time.delay_s: 0.5"), relative
+            to what is there (see `advice`); "" where no key helps.
+        hint: what else helps, in words.
     """
 
     stream: str
     message: str
     fix: str = ""
+    hint: str = ""
 
 
 @dataclass(frozen=True)

@@ -110,9 +110,8 @@ def _under_way(channel: Channel, densities: Array, bound: Array, stated: float) 
             f"Even with all motion in it, the {channel.name} varies no more than white noise of {most:.2g} {unit}, "
             f"{_beside(most, stated)}."
         )
-        return [
-            Finding("imu", message, f"streams.imu.noise.{channel.name}_density: {most:.2g}, unless inflated on purpose")
-        ]
+        fix = f"streams.imu.noise.{channel.name}_density: {most:.2g}"
+        return [Finding("imu", message, fix, "unless it was inflated on purpose")]
     return []
 
 

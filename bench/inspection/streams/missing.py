@@ -8,8 +8,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ..findings.fitting import MAD_TO_SIGMA
 from .channels import Channel
-from .neighbours import FEWEST, MAD_TO_SIGMA
+from .neighbours import FEWEST
 
 FEWEST_MARKED = 3
 """Rows: two equal values may be chance."""

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.state import Array, TimeArray
+from ..findings.fitting import MAD_TO_SIGMA
 from .channels import Channel
 
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of normal noise over its median absolute deviation: 1 / Φ⁻¹(3/4)."""
 NOISE_GAIN = np.sqrt(1 + 34 / 36)
 """Standard deviation of the residual over that of the readings, for white normal noise."""
 BLOCK = 100

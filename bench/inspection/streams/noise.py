@@ -97,8 +97,8 @@ def _changing(log: Log, channel: Channel, measured: NDArray[np.bool_], rounding:
         f"longest from {begin_s:.0f} to {end_s:.0f} s: no single sigma is right for all of it."
     )
     path = f"streams.{channel.stream}"
-    fix = f"{path}.sigma (columns, row by row), or {path}.outliers.above"
-    return [Finding(channel.stream, message, fix)]
+    hint = f"{path}.sigma (columns, row by row), or {path}.outliers.above"
+    return [Finding(channel.stream, message, hint=hint)]
 
 
 def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
@@ -119,5 +119,4 @@ def _off(channel: Channel, found: Array, ratio: Array) -> list[Finding]:
     fix = f"{channel.sigma_key}: " + (values[0] if len(values) == 1 else f"[{', '.join(values)}]")
     if not large:
         message += " The stated one is right only if most of the error is slow, which this check cannot see."
-        fix += ", if its errors are white"
-    return [Finding(channel.stream, message, fix)]
+    return [Finding(channel.stream, message, fix, "" if large else "only if its errors are white")]

@@ -110,7 +110,7 @@ def _strength(log: Log, norm: Array) -> list[Finding]:
     gravity, size = log.rig.gravity, float(np.median(norm))
     if size < NO_GRAVITY * gravity:
         message = f"The specific force is {size:.3g} m/s² strong: gravity was removed from it."
-        return [Finding("imu", message, "streams.imu.accel.columns: those of the raw specific force")]
+        return [Finding("imu", message, hint="streams.imu.accel.columns must name those of the raw specific force")]
     spread = float(robust_sigma(norm[:, None])[0])
     turning = float(np.mean(np.sum(log.imu.w_WI_I**2, axis=1))) * _speed(log) ** 2
     moving = (LEVEL_OVER_UPRIGHT * spread**2 + turning) / (
@@ -124,9 +124,7 @@ def _strength(log: Log, norm: Array) -> list[Finding]:
         "and "
         f"bias ({SIGMAS:g} × {log.rig.imu_noise.accel_bias_sigma:.2g}) and motion explain {allowed:.2g}. Scale or bias."
     )
-    return [
-        Finding("imu", message, f"streams.imu.accel.scale: {gravity / size:.4f} (times the one there), or its offset")
-    ]
+    return [Finding("imu", message, f"streams.imu.accel.scale: {gravity / size:.4f}", "or streams.imu.accel.offset")]
 
 
 def _speed(log: Log) -> float:
@@ -143,9 +141,7 @@ def _upright(rig: Rig, f_I: Array, size: float) -> list[Finding]:
     if length < NO_GRAVITY * size or size == 0 or tilt_deg <= TILTED_DEG:
         return []
     if 180 - tilt_deg < SQUARE_DEG:
-        message = "The specific force points down in the body (mean f along −z): z is down in these axes, not up."
-        fix = "streams.imu.axes: FRD (FLU, if it says FRD already); or mounting: {roll_deg: 180}"
-        return [Finding("imu", message, fix)]
+        return []  # the signs of gyro, heading and motion tell why
     R_BI, square = levelled(rig.imu.R_BS, f_B / length)
     yaw, pitch, roll = Rotation.from_matrix(R_BI).as_euler("ZYX", degrees=True) + 0.0
     axis = int(np.argmax(np.abs(f_I)))
@@ -154,11 +150,9 @@ def _upright(rig: Rig, f_I: Array, size: float) -> list[Finding]:
         f"{'−' if f_I[axis] < 0 else '+'}{'xyz'[axis]}."
         + ("" if square else " It is not a right angle: a tilted mounting, or a vehicle not level on average.")
     )
-    fix = (
-        f"streams.imu.mounting: {{roll_deg: {roll:.4g}, pitch_deg: {pitch:.4g}, yaw_deg: {yaw:.4g}}}; gravity does not "
-        "show the yaw, so add the one that turns the gyro's axes the vehicle's way"
-    )
-    return [Finding("imu", message, fix)]
+    fix = f"streams.imu.mounting: {{roll_deg: {roll:.4g}, pitch_deg: {pitch:.4g}, yaw_deg: {yaw:.4g}}}"
+    hint = "gravity does not show the yaw, so add the one that turns the gyro's axes the vehicle's way"
+    return [Finding("imu", message, fix, hint)]
 
 
 def levelled(R_BI: Array, up_B: Array) -> tuple[Array, bool]:
@@ -206,7 +200,7 @@ def gyro_against_gravity(log: Log) -> Tilting:
 
 
 def _rates(rate: float, tilting: Tilting) -> list[Finding]:
-    """Find rates in the wrong unit or of the wrong sign."""
+    """Find rates in the wrong unit."""
     in_degrees = "streams.imu.gyro.unit: deg/s"
     if tilting.correlation > TOGETHER and 0.5 < tilting.slope / DEGREE < 2:
         message = f"f tilts by {tilting.slope:.3f} of the gyro's rotation, about 1/57: degrees are read as radians."
@@ -214,10 +208,6 @@ def _rates(rate: float, tilting: Tilting) -> list[Finding]:
     if tilting.correlation > TOGETHER and 0.5 < tilting.slope * DEGREE < 2:
         message = f"f tilts by {tilting.slope:.3g} times the gyro's rotation, about 57: radians are read as degrees."
         return [Finding("imu", message, "streams.imu.gyro.unit: rad/s")]
-    if tilting.correlation < -TOGETHER:
-        message = "f tilts against the gyro (correlation {:.2f}): sign or axes of gyro and accelerometer differ."
-        fix = "streams.imu.gyro.scale: −1, or both sensors' columns in the same order and axes"
-        return [Finding("imu", message.format(tilting.correlation), fix)]
     if rate > FASTEST_RAD_S:
         return [
             Finding(

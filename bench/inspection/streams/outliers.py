@@ -68,7 +68,7 @@ def _finding(channel: Channel, out: NDArray[np.bool_]) -> Finding:
     above = float(f"{1.1 * np.quantile(size[~out], SPARED):.2g}")
     caught = float(np.mean(size[out] > above))
     if channel.stream != "imu" and caught >= CLEARLY:
-        fix = f"streams.{channel.stream}.outliers.above: {above:g} (drops {caught:.0%} of them)"
+        fix = f"streams.{channel.stream}.outliers.above: {above:g}  # drops {caught:.0%} of them"
         return Finding(channel.stream, message, fix)
     return Finding(
         channel.stream, message + " No bound on their size separates them from the rest: an estimator has to gate them."

@@ -176,8 +176,5 @@ def _bias(log: Log, bias: Array, total_s: float) -> list[Finding]:
         + f": {largest / max(noise.gyro_bias_sigma, 1e-12):.0f} times the stated turn-on bias "
         f"({noise.gyro_bias_sigma:.2g})."
     )
-    fix = (
-        f"streams.imu.noise.gyro_bias_sigma: {largest:.2g}; or subtract it by streams.imu.gyro.offset (in the file's "
-        "axes and unit, with the other sign)"
-    )
-    return [Finding("imu", message, fix)]
+    hint = "or subtract it by streams.imu.gyro.offset, in the file's axes and unit, with the other sign"
+    return [Finding("imu", message, f"streams.imu.noise.gyro_bias_sigma: {largest:.2g}", hint)]

@@ -77,15 +77,20 @@ def _stuck(channel: Channel, x: Array, names: list[str]) -> tuple[list[Finding],
     if all(stuck):
         value = ", ".join(f"{v:.4g}" for v in x[0] * channel.shown + 0.0)
         message = f"{channel.name} never changes: it reads ({value}) {channel.unit} in all {len(x)} rows."
-        fix = f"remove {path}" if channel.stream != "imu" else f"{path}.{channel.quantity}.columns"
-        return [Finding(channel.stream, message, fix)], stuck
+        if channel.stream == "imu":
+            return [Finding("imu", message, hint=f"{path}.{channel.quantity}.columns must name others")], stuck
+        return [Finding(channel.stream, message, f"{path}: null")], stuck
     found = []
     for k, name in enumerate(names):
         if stuck[k]:
             message = f"{name} is {channel.text(float(x[0, k]))} in every row: it was not measured, or it is stuck."
             by_axis = channel.stream in ("dvl", "gps")
-            fix = f"{channel.sigma_key}: .inf for that axis" if by_axis else f"{path}.{channel.quantity}.columns"
-            found.append(Finding(channel.stream, message, fix))
+            left_out = [s if not stuck[j] else np.inf for j, s in enumerate(channel.sigma * channel.shown)]
+            values = ", ".join(f"{s:.4g}" if np.isfinite(s) else ".inf" for s in left_out)
+            whole = by_axis and len(left_out) == channel.x.shape[1]
+            fix = f"{channel.sigma_key}: [{values}]" if whole else ""
+            hint = "" if whole else f"{path}.{channel.quantity}.columns must name others"
+            found.append(Finding(channel.stream, message, fix, hint))
     return found, stuck
 
 
@@ -101,16 +106,15 @@ def _missing(channel: Channel, missing: MissingRows) -> list[Finding]:
         )
         above = _between(size[~missing.marked], size[missing.marked])
         plain = above is not None and channel.stream != "imu" and not channel.turn
-        found.append(
-            Finding(channel.stream, message, valid + (f"; or {path}.outliers.above: {above:g}" if plain else ""))
-        )
+        fix = f"{path}.outliers.above: {above:g}" if plain else ""
+        found.append(Finding(channel.stream, message, fix, f"or {valid}" if plain else valid))
     if missing.zero.any():
         message = (
             f"{int(missing.zero.sum())} of {len(size)} rows of {channel.name} are exactly zero on every axis, the "
             f"others about {channel.text(float(np.median(size[missing.readings])))}: they hold no reading, but "
             "are used as readings."
         )
-        found.append(Finding(channel.stream, message, valid))
+        found.append(Finding(channel.stream, message, hint=valid))
     return found
 
 
@@ -143,8 +147,8 @@ def _repeats(channel: Channel, x: Array, good: NDArray[np.bool_], steps: list[Qu
         + (f" ({expected:.0f} would by chance)" if expected >= 1 else "")
         + ": they were repeated, not measured, and count twice."
     )
-    fix = f"streams.{channel.stream}.every, if each comes a fixed number of times; else drop them in the file"
-    return [Finding(channel.stream, message, fix)]
+    hint = f"streams.{channel.stream}.every, if each comes a fixed number of times; else drop them in the file"
+    return [Finding(channel.stream, message, hint=hint)]
 
 
 def _coarse(channel: Channel, x: Array, names: list[str], steps: list[Quantisation], sigma: Array) -> list[Finding]:
@@ -205,7 +209,7 @@ def _clipped(channel: Channel, x: Array, names: list[str], steps: list[Quantisat
             if channel.stream != "imu":
                 bound = min(abs(v) for v, _ in ends) * 0.999
                 component = "" if x.shape[1] == 1 else f", components: [{k}]"
-                fix = f"streams.{channel.stream}.outliers: {{above: {bound:.4g}{component}}} leaves those rows out"
+                fix = f"streams.{channel.stream}.outliers: {{above: {bound:.4g}{component}}}  # leaves those rows out"
             found.append(Finding(channel.stream, message, fix))
     return found
 
@@ -222,4 +226,4 @@ def _unsure(log: Log) -> list[Finding]:
         f"{int(unsure.sum())} of {len(unsure)} GPS fixes state a sigma over {UNSURE_GPS_M:g} m: the receiver had "
         "lost its satellites and repeats its last position, or a guess."
     )
-    return [Finding("gps", message, "streams.gps.valid: {column: its status, values: […]}")]
+    return [Finding("gps", message, hint="streams.gps.valid: {column: its status, values: […]}")]

@@ -16,6 +16,7 @@ import pytest
 import yaml
 from fathom.bench.cli.app import app
 from fathom.bench.inspection.findings.finding import Finding
+from fathom.bench.inspection.gross.gross import gross_check
 from fathom.bench.inspection.inspecting import SINGLE, inspect_log, open_to_inspect
 from fathom.bench.inspection.page import draw_inspection
 from fathom.bench.inspection.streams.allan import FLICKER, allan_deviation, bias_instability, white_density
@@ -47,8 +48,8 @@ def simulated(seed: int = 3, **keys: Any) -> Log:
 
 
 def wrong(log: Log) -> list[Finding]:
-    """What the checks of single streams find."""
-    return [finding for check in SINGLE for finding in check(log).findings]
+    """What the checks of single streams find, and the gross faults."""
+    return [finding for check in (*SINGLE, gross_check) for finding in check(log).findings]
 
 
 def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str) -> Finding:
@@ -553,8 +554,8 @@ def broken(folder: Path) -> Path:
 def test_what_opening_had_to_drop_is_found_and_only_that(tmp_path: Path) -> None:
     log, repairs = open_to_inspect(broken(tmp_path / "log"))
     findings = inspect_log(log, repairs).checks[0].findings
-    assert said(findings, "depth", "3 depth rows are not finite").fix.startswith("streams.depth.valid")
-    assert said(findings, "dvl", "2 dvl rows are out of order").fix.startswith("streams.dvl.time")
+    assert said(findings, "depth", "3 depth rows are not finite").hint.startswith("streams.depth.valid")
+    assert said(findings, "dvl", "2 dvl rows are out of order").hint.startswith("streams.dvl.time")
     again = write_folder(log, tmp_path / "again")
     assert any("(repair)" in note for note in open_to_inspect(again)[0].notes)
     assert open_to_inspect(again)[1] == ()  # its history tells of a repair, but there is nothing to repair
@@ -773,7 +774,7 @@ def test_the_command_prints_facts_findings_and_where_the_figure_is(
     assert "dvl      498 at 5 Hz" in out
     assert "What looks wrong" in out
     assert "2. 2 dvl rows are out of order" in out or "1. 2 dvl rows are out of order" in out
-    assert "→ log.yaml: streams.dvl.time.column" in out
+    assert "→ streams.dvl.time.column" in out
     assert out.splitlines()[-1] == "figure: inspect-lawnmower-tactical-s3.png"
     assert (tmp_path / "inspect-lawnmower-tactical-s3.png").read_bytes().startswith(b"\x89PNG")
 

@@ -13,11 +13,13 @@ import yaml
 from fathom.bench.drawing import empty_figure
 from fathom.bench.inspection.between.clock import fit_clocks
 from fathom.bench.inspection.between.cross_checks import cross_checks
-from fathom.bench.inspection.between.fitting import Estimate, blocks_of, least_squares
 from fathom.bench.inspection.between.lever_arm import products
 from fathom.bench.inspection.between.pair_check import Delay
+from fathom.bench.inspection.findings.advice import resolved
 from fathom.bench.inspection.findings.finding import Check, Finding
+from fathom.bench.inspection.findings.fitting import Estimate, blocks_of, least_squares
 from fathom.datasets import Log, Scenario, Trajectory, open_log, simulate
+from fathom.datasets.described.description import read_description
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.opening import CATALOG
 from fathom.datasets.log import DvlStream, ImuStream
@@ -75,29 +77,12 @@ def some_fast(cases: dict[str, Any], count: int) -> list[Any]:
     return [name if i < count else pytest.param(name, marks=pytest.mark.slow) for i, name in enumerate(cases)]
 
 
-OTHER = {"yaw": "compass", "compass": "yaw", "up": "down", "down": "up", "FRD": "FLU", "FLU": "FRD", "NED": "ENU"}
-
-
 def fix(file: Path, finding: Finding) -> None:
-    """Put into a description what a finding proposes, as a reader would, on top of what stands there."""
-    described = yaml.safe_load(file.read_text())
-    path, said = finding.fix.split(": ", 1)
-    text, _, remark = said.partition("#")
-    value, now = yaml.safe_load(text), described
-    for part in path.split("."):
-        now = now.get(part) if isinstance(now, dict) else None
-    if "whichever" in remark:
-        value = OTHER[now] if now else value
-    elif "with" in remark:  # the file that write_folder makes has yaw, and up
-        value = float(remark.split()[-1])
-    if path.endswith(("offset", "offset_s", "add_deg")) and now is not None:
-        value += now
-    if path.endswith("scale") and now is not None:
-        value = np.multiply(value, now).tolist()
-    if path.endswith("time.delay_s"):
-        change(described, path.replace("delay_s", "received"), None)  # a delay is stated or received, not both
-    change(described, path, value)
-    file.write_text(yaml.safe_dump(described))
+    """Put the lines that a finding proposes for a description into it, as they are."""
+    proposed = resolved(finding, read_description(file))
+    assert proposed.fix, finding
+    lines = (line.split(": ", 1) for line in proposed.fix.split("\n"))
+    rewrite(file, {path: yaml.safe_load(value) for path, value in lines})
 
 
 # (a) clean logs
@@ -242,6 +227,26 @@ def test_a_steady_course_says_that_the_lever_arm_is_not_observable() -> None:
         "not observable" in value for name, value in check.facts.items() if name in ("IMU's place from the DVL",)
     )
     assert check.findings == ()
+
+
+@pytest.mark.parametrize("mission", ["lawnmower", "box"])
+def test_a_truth_of_another_point_is_found_and_no_sensor_blamed(mission: str) -> None:
+    log = sail(mission=mission)
+    assert log.truth is not None
+    p = log.truth.p_WB_W + log.truth.R_WB @ [1.5, -0.5, 0.0]
+    (finding,) = findings(replace(log, truth=replace(log.truth, p_WB_W=p, v_WB_W=None)))
+    assert finding.stream == "truth"
+    found = [float(each) for each in re.findall(r"(-?[\d.]+) ±", finding.message)]
+    np.testing.assert_allclose(found, [-1.5, 0.5], atol=0.05)
+
+
+def test_a_truth_by_another_clock_is_found() -> None:
+    log = sail()
+    assert log.truth is not None
+    late = replace(log.truth, t_ns=log.truth.t_ns + 300_000_000)
+    (finding,) = findings(replace(log, truth=late))
+    assert finding.stream == "truth"
+    assert float(finding.fix.removeprefix("truth.time.clock_offset_s: ")) == pytest.approx(-0.3, abs=0.02)
 
 
 # (b) descriptions that are wrong

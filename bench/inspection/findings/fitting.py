@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from ....datasets.state import Array
-from ..streams.neighbours import MAD_TO_SIGMA
 
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of normal noise over its median absolute deviation: 1 / Φ⁻¹(3/4)."""
 BLOCKS = 12
 """Enough for 11 degrees of freedom, few enough that errors of one block hardly reach into the next."""
 FALSE_ALARM = 1e-3

@@ -1,0 +1,284 @@
+"""Gross faults: each is found by what caused it, its advice is a valid log.yaml, and with it the finding is gone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from fathom.bench.inspection.findings.advice import resolved
+from fathom.bench.inspection.findings.finding import Finding
+from fathom.bench.inspection.gross.gross import gross_check, quick_findings
+from fathom.bench.inspection.inspecting import inspect_log, open_to_inspect
+from fathom.datasets import Log, Scenario, open_log, simulate
+from fathom.datasets.described.description import read_description
+from fathom.datasets.described.folder import write_folder
+from fathom.datasets.described.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from fathom.datasets.log import HeadingStream, ImuStream, ReadingStream
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
+from fathom.datasets.simulated.missions import MISSIONS
+from fathom.datasets.state import Array
+
+PORTO = (41.185, -8.706)
+SWAPPED_YZ = np.diag([1.0, -1.0, -1.0])
+
+
+@cache
+def sail(mission: str = "lawnmower", seed: int = 1, imu: str = "industrial", duration_s: float = 600.0) -> Log:
+    dials = {"mission": mission, "duration_s": duration_s, "imu": {"noise": imu, "rate_hz": 25.0}}
+    log = simulate(Scenario.from_dict(dials), seed=seed)
+    assert log.truth is not None
+    return replace(log, prior=None, truth=log.truth.select(slice(None, None, 10)))
+
+
+def imu(gyro: Any = 1.0, accel: Any = 1.0, late_s: float = 0.0) -> Callable[[Log], Log]:
+    """What multiplies the readings of gyro and accelerometer, in the IMU's axes, and a shift of its clock."""
+
+    def of(log: Log) -> Log:
+        w, f = (x @ m if np.ndim(m) else x * m for x, m in ((log.imu.w_WI_I, gyro), (log.imu.f_I, accel)))
+        return replace(log, imu=ImuStream(log.imu.t_ns + round(late_s * 1e9), w, f))
+
+    return of
+
+
+def stream(name: str, scale: Any = 1.0, late_s: float = 0.0, order: Any = slice(None)) -> Callable[[Log], Log]:
+    """The same of an aiding sensor."""
+
+    def of(log: Log) -> Log:
+        old: ReadingStream = getattr(log, name)
+        shift = round(late_s * 1e9)
+        new = type(old)(old.t_ns + shift, old.received_ns + shift, old.z[:, order] * scale, old.sigma)
+        return replace(log, **{name: new})
+
+    return of
+
+
+def turned(name: str, degrees: float) -> Callable[[Log], Log]:
+    """A DVL, or a heading sensor, turned counter-clockwise."""
+
+    def of(log: Log) -> Log:
+        old: ReadingStream = getattr(log, name)
+        a = np.radians(degrees)
+        c, s = np.cos(a), np.sin(a)
+        z = old.z @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) if name == "dvl" else old.z + a
+        return replace(log, **{name: type(old)(old.t_ns, old.received_ns, z, old.sigma)})
+
+    return of
+
+
+def heading(of_psi: Callable[[Array], Array]) -> Callable[[Log], Log]:
+    def of(log: Log) -> Log:
+        old = log.heading
+        assert isinstance(old, HeadingStream)
+        return replace(log, heading=HeadingStream(old.t_ns, old.received_ns, of_psi(old.z), old.sigma))
+
+    return of
+
+
+def sigma(name: str, factor: float) -> Callable[[Log], Log]:
+    def of(log: Log) -> Log:
+        old: ReadingStream = getattr(log, name)
+        return replace(log, **{name: type(old)(old.t_ns, old.received_ns, old.z, old.sigma * factor)})
+
+    return of
+
+
+def without(*names: str) -> Callable[[Log], Log]:
+    return lambda log: replace(log, **dict.fromkeys(names))
+
+
+FAULTS: dict[str, tuple[tuple[Callable[[Log], Log], ...], str, str]] = {
+    # what is done to a right log, the stream blamed, and words of the finding
+    "accelerometer in g": ((imu(accel=1 / 9.80665),), "imu", "it is in g"),
+    "gravity upside down": ((imu(accel=-1.0),), "imu", "the sign of the accelerometer is wrong"),
+    "gyro in degrees": ((imu(gyro=180 / np.pi),), "imu", "deg"),
+    "gyro read as degrees": ((imu(gyro=np.pi / 180),), "imu", "rad"),
+    "gyro of 0.6": ((imu(gyro=0.6),), "imu", "scale is off"),
+    "gyro of 1.4": ((imu(gyro=1.4),), "imu", "scale is off"),
+    "gyro's vertical axis": ((imu(np.diag([1, 1, 0.6])), without("truth")), "imu", "z axis"),
+    "gyro negated": ((imu(gyro=-1.0),), "imu", "the sign of the gyro is wrong"),
+    "left-handed x": ((imu(np.diag([-1, 1, 1]), np.diag([-1, 1, 1])),), "imu", "left-handed"),
+    "left-handed y": ((imu(np.diag([1, -1, 1]), np.diag([1, -1, 1])),), "imu", "left-handed"),
+    "left-handed z": ((imu(np.diag([1, 1, -1]), np.diag([1, 1, -1])),), "imu", "left-handed"),
+    "gyro x negated": ((imu(np.diag([-1, 1, 1])),), "imu", "x of the gyro is negated"),
+    "accelerometer y negated": ((imu(accel=np.diag([1, -1, 1])),), "imu", "y of the accelerometer is negated"),
+    "gyro FRD": ((imu(SWAPPED_YZ),), "imu", "y and z of the gyro are negated"),
+    "accelerometer FRD": ((imu(accel=SWAPPED_YZ),), "imu", "y and z of the accelerometer are negated"),
+    "IMU FRD": ((imu(SWAPPED_YZ, SWAPPED_YZ),), "imu", "points down in the body"),
+    "gyro's columns exchanged": ((imu(np.eye(3)[[1, 0, 2]]),), "imu", "must be read as (y, x, z)"),
+    "IMU turned by 90°": ((imu(*2 * [np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])]),), "imu", "yaw on the vehicle"),
+    "gyro of 0.6 alone": ((imu(gyro=0.6), without("heading", "truth")), "imu", "scale is off"),
+    "IMU's clock": ((imu(late_s=18.0),), "imu", "18.0 s late"),
+    "compass for yaw": ((heading(lambda psi: np.pi / 2 - psi),), "heading", "compass"),
+    "heading in radians": ((heading(lambda psi: np.radians(np.angle(np.exp(1j * psi)))),), "heading", "radians"),
+    "heading late": ((stream("heading", late_s=18.0),), "heading", "18.0 s late"),
+    "heading turned by 20°": ((turned("heading", 20.0),), "heading", "must be turned by -20"),
+    "heading turned": ((turned("heading", 90.0),), "heading", "must be turned by -"),
+    "DVL turned by 90°": ((turned("dvl", 90.0),), "dvl", "its yaw on the vehicle"),
+    "DVL turned by 180°": ((turned("dvl", 180.0),), "dvl", "its yaw on the vehicle"),
+    "DVL turned by 45°": ((turned("dvl", 45.0),), "dvl", "its yaw on the vehicle"),
+    "DVL in cm/s": ((stream("dvl", 100.0),), "dvl", "ratio of cm/s"),
+    "DVL in mm/s": ((stream("dvl", 1000.0),), "dvl", "ratio of mm/s"),
+    "GPS late": ((stream("gps", late_s=18.0), without("truth")), "gps", "18 leap seconds"),
+    "GPS early": ((stream("gps", late_s=-18.0), without("truth")), "gps", "s early"),
+    "GPS a minute late": ((stream("gps", late_s=60.0), without("truth")), "gps", "s late"),
+    "GPS west for east": ((stream("gps", [-1, 1, 1]),), "gps", "hemisphere W"),
+    "GPS south for north": ((stream("gps", [1, -1, 1]),), "gps", "hemisphere S"),
+    "GPS both": ((stream("gps", [-1, -1, 1]),), "gps", "S and W"),
+    "GPS NED": ((stream("gps", [1, 1, -1], order=[1, 0, 2]),), "gps", "east and north are exchanged"),
+    "depth turned over": ((stream("depth", -1.0),), "depth", "up and down are exchanged"),
+    "depth in mm": ((stream("depth", 1000.0),), "depth", "ratio of mm"),
+    "depth in bar": ((stream("depth", 0.1),), "depth", "ratio of bar"),
+    "depth late": ((stream("depth", late_s=18.0),), "depth", "s late"),
+    "depth's sigma": ((sigma("depth", 1e-3),), "depth", "times the stated sigma"),
+    "heading's sigma": ((sigma("heading", 1e4),), "heading", "no sensor's"),
+}
+
+
+def marred(what: str) -> Log:
+    log = sail()
+    for fault in FAULTS[what][0]:
+        log = fault(log)
+    return log
+
+
+def found_in(folder: Path) -> tuple[Finding, ...]:
+    description = read_description(folder / "log.yaml")
+    return tuple(resolved(finding, description) for finding in quick_findings(open_log(folder)))
+
+
+def apply(folder: Path, finding: Finding) -> None:
+    """Put the lines of a fix into log.yaml, as they are."""
+    raw = yaml.safe_load((folder / "log.yaml").read_text())
+    for line in finding.fix.split("\n"):
+        path, value = line.split(": ", 1)
+        *parents, last = path.split(".")
+        part = raw
+        for key in parents:
+            part = part.setdefault(key, {})
+        part[last] = yaml.safe_load(value)
+    (folder / "log.yaml").write_text(yaml.safe_dump(raw))
+
+
+@pytest.mark.parametrize("what", FAULTS)
+def test_a_gross_fault_is_found_and_its_advice_mends_it(what: str, tmp_path: Path) -> None:
+    _, blamed, words = FAULTS[what]
+    folder = write_folder(marred(what), tmp_path / "log")
+    findings = found_in(folder)
+    assert {finding.stream for finding in findings} == {blamed}, findings
+    assert any(words in finding.message for finding in findings), findings
+    for finding in findings:
+        assert finding.fix, finding
+        apply(folder, finding)
+    assert found_in(folder) == ()
+
+
+@pytest.mark.parametrize("what", ["left-handed y", "GPS early", "depth turned over"])
+def test_inspect_says_it_too_and_blames_no_other_stream(what: str, tmp_path: Path) -> None:
+    _, blamed, words = FAULTS[what]
+    folder = write_folder(marred(what), tmp_path / "log")
+    inspection = inspect_log(*open_to_inspect(folder), read_description(folder / "log.yaml"))
+    assert {finding.stream for finding in inspection.findings} == {blamed}
+    assert any(words in finding.message for finding in inspection.findings)
+
+
+def test_gravity_that_is_not_there_is_found() -> None:
+    (finding,) = quick_findings(imu(accel=0.0)(sail()))
+    assert "gravity was removed" in finding.message
+
+
+TRUTH: dict[str, tuple[Callable[[Array], Array], float, str]] = {
+    "late": (lambda p: p, 18.0, "18.0 s late"),
+    "early": (lambda p: p, -2.0, "2.0 s early"),
+    "west for east": (lambda p: p * [-1, 1, 1], 0.0, "hemisphere W"),
+    "NED": (lambda p: p[:, [1, 0, 2]] * [1, 1, -1], 0.0, "east and north are exchanged"),
+    "upside down": (lambda p: p * [1, 1, -1], 0.0, "up and down are exchanged"),
+}
+
+
+@pytest.mark.parametrize("what", TRUTH)
+def test_a_truth_that_is_grossly_wrong_is_found(what: str) -> None:
+    of_p, late_s, words = TRUTH[what]
+    log = sail()
+    assert log.truth is not None
+    p, t_ns = of_p(log.truth.p_WB_W), log.truth.t_ns + round(late_s * 1e9)
+    (finding,) = quick_findings(replace(log, truth=replace(log.truth, p_WB_W=p, t_ns=t_ns, v_WB_W=None)))
+    assert finding.stream == "truth"
+    assert words in finding.message
+
+
+def geodetic(folder: Path, log: Log, **columns: str) -> Path:
+    """Write a log with fixes as latitude and longitude, read from the columns given."""
+    write_folder(replace(log, truth=None), folder)
+    assert log.gps is not None
+    latitude, longitude = (np.array([np.radians(x)]) for x in PORTO)
+    at_origin = ecef_from_geodetic(latitude, longitude, np.zeros(1))
+    flat = np.column_stack([log.gps.z[:, :2], np.zeros(len(log.gps))])
+    lat, lon, _ = geodetic_from_ecef(at_origin + flat @ enu_axes(latitude, longitude)[0])
+    table = pd.read_parquet(folder / "gps.parquet").assign(lat=np.degrees(lat), lon=np.degrees(lon))
+    table.assign(west=-table["lon"]).to_parquet(folder / "gps.parquet")
+    raw = yaml.safe_load((folder / "log.yaml").read_text())
+    del raw["streams"]["gps"]["position"]
+    raw["streams"]["gps"]["geodetic"] = {"latitude": "lat", "longitude": "lon"} | columns
+    (folder / "log.yaml").write_text(yaml.safe_dump(raw))
+    return folder
+
+
+def test_latitude_and_longitude_that_are_exchanged_are_found(tmp_path: Path) -> None:
+    folder = geodetic(tmp_path / "log", sail(), latitude="lon", longitude="lat")
+    (finding,) = found_in(folder)
+    assert "swapped" in finding.message
+    apply(folder, finding)
+    assert yaml.safe_load((folder / "log.yaml").read_text())["streams"]["gps"]["geodetic"]["latitude"] == "lat"
+    assert found_in(folder) == ()
+
+
+def test_a_lost_hemisphere_is_found_and_no_compass_blamed(tmp_path: Path) -> None:
+    (finding,) = found_in(geodetic(tmp_path / "log", sail(), longitude="west"))
+    assert finding.stream == "gps"
+    assert "hemisphere W" in finding.message
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_milliseconds_taken_for_seconds_are_found(factor: float) -> None:
+    log = sail()
+    assert log.dvl is not None
+    t_ns = (log.dvl.t_ns * factor).astype(np.int64)
+    dvl = type(log.dvl)(t_ns, t_ns, log.dvl.z, log.dvl.sigma)
+    (finding,) = quick_findings(replace(log, dvl=dvl))
+    assert finding.stream == "dvl"
+    assert f"last {factor:g} times as long" in finding.message
+
+
+def test_what_does_not_show_is_not_guessed() -> None:
+    steady = Scenario(mission="transit", duration_s=120.0, wobble_deg=0.0, leg_m=1e4, depth_m=1.0)
+    log = replace(simulate(steady, seed=1), truth=None)
+    assert log.gps is not None
+    mirrored = type(log.gps)(log.gps.t_ns, log.gps.received_ns, log.gps.z * [-1, 1, 1], log.gps.sigma)
+    assert not [finding for finding in gross_check(replace(log, gps=mirrored)).findings if finding.fix]
+
+
+@pytest.mark.parametrize(
+    ("mission", "grade"), [("lawnmower", "consumer"), ("helix", "tactical"), ("box", "navigation")]
+)
+def test_a_right_log_gives_no_alarm(mission: str, grade: str) -> None:
+    assert quick_findings(sail(mission, imu=grade)) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("grade", IMU_GRADES)
+@pytest.mark.parametrize("mission", MISSIONS)
+def test_no_right_log_gives_an_alarm(mission: str, grade: str, seed: int) -> None:
+    assert quick_findings(sail(mission, seed, grade, [120.0, 900.0][seed])) == ()
+
+
+def test_recorded_logs_give_no_alarm(recorded_data: Path) -> None:
+    names = [path.name for path in sorted(recorded_data.iterdir()) if path.is_dir()]
+    assert {name: quick_findings(open_log(name, recorded_data)) for name in names} == dict.fromkeys(names, ())
