@@ -39,6 +39,7 @@ def run(
     Every estimator of EXPERIMENT runs on each of its logs. Finished runs are kept. They are repeated only if their
     spec, their log or a version has changed.
     """
+    from ..errors import ExperimentError, StoppedError
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
     from ..output.present import present, print_log
@@ -53,7 +54,12 @@ def run(
 
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
         outcome = sweep(plan, data, out, jobs, only, repair, force, dask, print_finished)
-    present(outcome, plan, folder, printed)
+    try:
+        present(outcome, plan, folder, printed)
+    except ExperimentError as error:
+        if outcome.made:
+            raise StoppedError(str(error)) from None
+        raise
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)

@@ -34,12 +34,12 @@ class Verb(TyperCommand):
         except ValueError as error:
             from ...datasets.errors import DatasetError
             from ...estimators.registry import EstimatorError
-            from ..errors import ExperimentError
+            from ..errors import ExperimentError, StoppedError
             from ..metrics.association import ScoreError
 
             if not isinstance(error, DatasetError | EstimatorError | ExperimentError | ScoreError):
                 raise
-            refuse(" ".join(str(error).split()))
+            refuse(" ".join(str(error).split()), SOME_FAILED if isinstance(error, StoppedError) else BAD_INPUT)
 
 
 @contextmanager
@@ -52,10 +52,10 @@ def on_interrupt(message: str) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def refuse(message: str) -> None:
-    """Print why nothing was run, and exit with status 2."""
+def refuse(message: str, status: int = BAD_INPUT) -> None:
+    """Print why nothing was run, or why it stopped, and exit."""
     say(f"fathom: {message}")
-    raise typer.Exit(BAD_INPUT) from None
+    raise typer.Exit(status) from None
 
 
 def say(message: str) -> None:

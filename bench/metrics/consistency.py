@@ -155,7 +155,8 @@ def pooled_nis(runs: Sequence[Mapping[str, Any]]) -> dict[str, Average]:
     total: dict[str, list[tuple[float, int]]] = {}
     for run in runs:
         for sensor, dof in json.loads(run["nis_dof"] or "{}").items():
-            total.setdefault(sensor, []).append((run[f"nis_{sensor}"] * dof, dof))
+            if (nis := run.get(f"nis_{sensor}")) is not None:
+                total.setdefault(sensor, []).append((nis * dof, dof))
     found = {}
     for sensor, each in total.items():
         sums, dofs = (np.array(column) for column in zip(*each, strict=True))

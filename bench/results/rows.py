@@ -95,14 +95,14 @@ def read_rows(connection: sqlite3.Connection, log: str | None = None) -> pd.Data
         connection.text_factory = str
     columns = dict(zip(COLUMNS, map(list, zip(*rows, strict=True)), strict=True)) if rows else {c: [] for c in COLUMNS}
     del rows
-    _replace_unreadable(columns)
     columns["spec"] = [_shared_spec(*of, shared) for of in zip(columns["spec"], columns["seed"], strict=True)]
+    _replace_unreadable(columns)
     kinds = {"TEXT": "object", "REAL": "float64", "INTEGER": "Int64"}
     return pd.DataFrame({name: pd.Series(columns.pop(name), dtype=kinds[kind]) for name, kind in COLUMNS.items()})
 
 
-def _shared_spec(spec: str | None, seed: int | None, shared: dict[Any, str]) -> str | None:
-    text, found, rest = (spec or "").partition(f'"seed": {json.dumps(seed)}, ')
+def _shared_spec(spec: Any, seed: Any, shared: dict[Any, str]) -> Any:
+    text, found, rest = spec.partition(f'"seed": {seed}, ') if isinstance(spec, str) else ("", "", "")
     return shared.setdefault(text + rest, text + rest) if found else spec
 
 

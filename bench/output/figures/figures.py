@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import pandas as pd
 from matplotlib.figure import Figure
 
 from ...drawing import looks_of, save
-from ...results.summary import Record, file_names, groups, records, summarise
+from ...results.summary import Record, Rows, file_names, groups, records, summarise
 from ..estimates import tracks_of
 from .ablation import draw_ablation
 from .consistency import draw_nees
@@ -23,7 +22,7 @@ Tell = Callable[[int, int], None]
 
 
 def draw_figures(
-    rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = (), tell: Tell = lambda done, total: None
+    rows: Rows, folder: Path, differences: Sequence[Record] = (), tell: Tell = lambda done, total: None
 ) -> list[Path]:
     """Draw every figure of an experiment into folder/figures and return the files; a figure without data is left out.
 
@@ -41,11 +40,10 @@ def draw_figures(
     return files
 
 
-def _figures(
-    rows: pd.DataFrame, folder: Path, differences: Sequence[Record]
-) -> list[tuple[Path, Callable[[], Figure]]]:
+def _figures(rows: Rows, folder: Path, differences: Sequence[Record]) -> list[tuple[Path, Callable[[], Figure]]]:
     """Return the path, without suffix, of each figure that has data, and the function that draws it."""
-    every, summary = records(rows), summarise(rows)
+    every = records(rows)
+    summary = summarise(every)
     looks = looks_of([label for (label,) in groups(every, "label")])
     stems = {log: folder / "figures" / name for log, name in file_names(row["log"] for row in every).items()}
     found: list[tuple[Path, Callable[[], Figure]]] = []

@@ -10,13 +10,11 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
-import pandas as pd
-
 from ...drawing import looks_of
 from ...errors import ExperimentError
 from ...files import write_whole, writing
 from ...results.store import load_runs
-from ...results.summary import Record, groups, records, summarise
+from ...results.summary import Record, Rows, groups, records, summarise
 from .. import cells, sheets
 from ..remarks import mostly_outside, not_positive
 from . import curves, runs
@@ -41,15 +39,13 @@ def report(folder: Path, file: Path | None = None) -> Path:
         ExperimentError: no store there, an empty one, or the page cannot be written; NoExtraError without the extra.
     """
     check_extra()
-    rows = load_runs(folder)
+    rows = load_runs(folder, shared_specs=True)
     if rows.empty:
         raise ExperimentError(f"{folder / 'runs.sqlite'}: there is no run in it; `fathom run` makes them")
     return write_report(in_order(rows, folder), folder, differences_of(folder), file)
 
 
-def write_report(
-    rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = (), file: Path | None = None
-) -> Path:
+def write_report(rows: Rows, folder: Path, differences: Sequence[Record] = (), file: Path | None = None) -> Path:
     """Write the page of these rows and return the file.
 
     Args:
@@ -78,7 +74,7 @@ def check_extra() -> None:
         raise NoExtraError(f"{error}; the report needs an extra: pip install 'fathom-bench[report]'") from None
 
 
-def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> str:
+def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
     """Return the page's HTML.
 
     Raises:
@@ -89,7 +85,8 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
     from markupsafe import Markup
     from plotly.offline import get_plotlyjs
 
-    every, summary = records(rows), summarise(rows)
+    every = records(rows)
+    summary = summarise(every)
     by_log = {log: of for (log,), of in groups(summary, "log").items()}
     done = _done(every)
     drawn = draw_all(every, folder / "trajectories")
