@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,10 +16,18 @@ from ...results.summary import Record, Rows, groups, records, summarise
 from .. import cells, sheets
 from ..remarks import mostly_outside, not_positive
 from . import curves, runs
+from .packing import embedded, packed, packed_text
 from .results import differences_of, in_order, kept_plan
 from .tracks import Drawn, draw_all
 
 HERE = Path(__file__).parent
+SCRIPTS = ("tables.js", "runs.js", "figures.js")
+POSES = 100_000
+"""Poses that a page may hold, 48 bytes each, 64 as base64: 6.4 MB."""
+POSES_OF_A_ROW = 4
+"""A row of the store takes as much of the page as so many poses: 250 bytes, compressed, as base64."""
+LEAST_POSES = 20_000
+"""That have room beside any number of rows."""
 
 
 class NoExtraError(ExperimentError):
@@ -89,7 +95,9 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
     summary = summarise(every)
     by_log = {log: of for (log,), of in groups(summary, "log").items()}
     done = _done(every)
-    drawn = draw_all(every, folder / "trajectories")
+    drawn = draw_all(every, folder / "trajectories", max(LEAST_POSES, POSES - POSES_OF_A_ROW * len(every)))
+    table, whys = runs.table(every)
+    common, blocks = runs.details(every)
     logs = [
         {
             "name": log,
@@ -113,7 +121,7 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
         description="" if plan is None else plan.description,
         again=None if again is None else quote(again),
         folder=quote(str(folder)),
-        example=next(((row["identity"] or "")[: sheets.SHOWN_OF_IDENTITY] for row in every if row["identity"]), None),
+        example=next(((row["identity"] or "")[: runs.SHOWN_OF_IDENTITY] for row in every if row["identity"]), None),
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         facts=runs.facts(every),
         failures=runs.failures(every),
@@ -125,13 +133,18 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
         late=_there(map(sheets.late_or_out, by_log.values())),
         costs=_there(map(sheets.cost, by_log.values())),
         logs=logs,
-        runs=sheets.every_run(every),
+        runs=every,
+        exact=runs.EXACT,
+        every_run=runs.heading(len(every), whys),
+        table_of_runs=table,
+        common=common,
+        details=blocks,
         environments=runs.environments(every),
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
-        scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in ("tables.js", "figures.js")],
-        plotly=Markup(get_plotlyjs()),
+        scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in SCRIPTS],
+        plotly=packed_text(get_plotlyjs()),
         embedded=embedded,
-        details=runs.details(every),
+        packed=packed,
         page={
             "looks": curves.looks(looks_of([label for (label,) in groups(every, "label")])),
             "axes": axes(),
@@ -160,22 +173,6 @@ def ordinal(k: int) -> str:
     """Return "2nd", "3rd", "4th", "11th", "22nd"."""
     suffix = "th" if k % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(k % 10, "th")
     return f"{k}{suffix}"
-
-
-def embedded(value: Any) -> Any:
-    """Return a value as JSON for a script element, which no text in it can end; non-finite numbers are null."""
-    from markupsafe import Markup
-
-    text = json.dumps(_finite(value), separators=(",", ":"))
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _done(every: Sequence[Record]) -> sheets.Done:
