@@ -87,23 +87,26 @@ def read_rows(connection: sqlite3.Connection, log: str | None = None) -> pd.Data
     check_columns(connection)
     chosen = "" if log is None else "WHERE log IS :log"
     query = f"SELECT {', '.join(COLUMNS)} FROM runs {chosen} ORDER BY rowid"
-    shared: dict[Any, str] = {}  # most texts are the same in many rows
-    connection.text_factory = lambda text: shared.get(text) or shared.setdefault(text, text.decode("utf-8", "replace"))
+    texts: dict[str, str] = {}  # most texts are the same in many rows
+    connection.text_factory = lambda text: text.decode("utf-8", "replace")
+    columns: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     try:
-        rows = connection.execute(query, {"log": log}).fetchall()
+        for row in connection.execute(query, {"log": log}):
+            for (name, column), value in zip(columns.items(), row, strict=True):
+                if name == "spec":
+                    value = _without_seed(value, columns["seed"][-1])
+                column.append(texts.setdefault(value, value) if isinstance(value, str) else value)
     finally:
         connection.text_factory = str
-    columns = dict(zip(COLUMNS, map(list, zip(*rows, strict=True)), strict=True)) if rows else {c: [] for c in COLUMNS}
-    del rows
-    columns["spec"] = [_shared_spec(*of, shared) for of in zip(columns["spec"], columns["seed"], strict=True)]
+    del texts
     _replace_unreadable(columns)
     kinds = {"TEXT": "object", "REAL": "float64", "INTEGER": "Int64"}
     return pd.DataFrame({name: pd.Series(columns.pop(name), dtype=kinds[kind]) for name, kind in COLUMNS.items()})
 
 
-def _shared_spec(spec: Any, seed: Any, shared: dict[Any, str]) -> Any:
-    text, found, rest = spec.partition(f'"seed": {seed}, ') if isinstance(spec, str) else ("", "", "")
-    return shared.setdefault(text + rest, text + rest) if found else spec
+def _without_seed(spec: Any, seed: Any) -> Any:
+    part = f'"seed": {seed}, '
+    return spec.replace(part, "") if isinstance(spec, str) and spec.count(part) == 1 else spec
 
 
 def whole_spec(spec: str | None, seed: int | None) -> str | None:

@@ -8,6 +8,9 @@ import math
 from base64 import b64encode
 from typing import Any
 
+LEVEL = 6
+"""Of compression: 9 takes twice the time for 1 % less."""
+
 
 def embedded(value: Any) -> Any:
     """Return a value as JSON for a script element, which no text in it can end; non-finite numbers are null."""
@@ -23,7 +26,7 @@ def packed(value: Any) -> str:
 
 def packed_text(text: str) -> str:
     """Return a text as the base64 of gzip; the same text gives the same letters."""
-    return b64encode(gzip.compress(text.encode(errors="backslashreplace"), mtime=0)).decode("ascii")
+    return b64encode(gzip.compress(text.encode(errors="backslashreplace"), LEVEL, mtime=0)).decode("ascii")
 
 
 def _json(value: Any) -> str:

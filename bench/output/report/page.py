@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -89,7 +90,6 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
     check_extra()
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
-    from plotly.offline import get_plotlyjs
 
     every = records(rows)
     summary = summarise(every)
@@ -142,7 +142,7 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
         environments=runs.environments(every),
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
         scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in SCRIPTS],
-        plotly=packed_text(get_plotlyjs()),
+        plotly=_packed_plotly(),
         embedded=embedded,
         packed=packed,
         page={
@@ -151,6 +151,13 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
             "logs": [{key: log[key] for key in ("name", "truth", "aligned", "anees", "costs")} for log in logs],
         },
     )  # fmt: skip
+
+
+@cache
+def _packed_plotly() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return packed_text(get_plotlyjs())
 
 
 def axes() -> dict[str, Any]:

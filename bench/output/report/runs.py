@@ -182,7 +182,7 @@ def heading(rows: int, whys: Sequence[str]) -> Sheet:
     return Sheet("Every run", note, headings, [], "log")
 
 
-@lru_cache(maxsize=50_000)
+@lru_cache(maxsize=1000)
 def _loads(text: str | None) -> Any:
     """Return what a JSON column holds; an empty dict for none, and the text itself where it is no JSON."""
     try:
