@@ -21,8 +21,8 @@ MANY_SEEDS = 1000
 exponential distribution it moves the ends by 3 % of their distance from the mean, and less with every seed more."""
 ENOUGH = 1999
 """Draws of many seeds: the ends of an interval at 95 % then have an error of 2 % of its width."""
-BATCH = 2_000_000
-"""Numbers drawn at a time: 16 MB for each array."""
+BATCH = 500_000
+"""Numbers drawn at a time: 4 MB for each array."""
 
 
 def bootstrap_interval(
