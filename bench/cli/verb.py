@@ -31,6 +31,11 @@ class Verb(TyperCommand):
         try:
             with on_interrupt("interrupted"):
                 return super().invoke(ctx)
+        except MemoryError as error:
+            detail = f" ({error})" if str(error) else ""
+            refuse(
+                f"not enough memory{detail}; end other programs, or give less: fewer --jobs, a shorter log", SOME_FAILED
+            )
         except ValueError as error:
             from ...datasets.errors import DatasetError
             from ...estimators.registry import EstimatorError

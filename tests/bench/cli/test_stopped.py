@@ -94,6 +94,16 @@ def test_a_store_that_another_program_writes_to_is_told_so(
     assert "another program has it open to write" in said
 
 
+def test_memory_that_is_not_enough_is_told_as_memory(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def large(*_: object) -> None:
+        raise MemoryError("Unable to allocate 3.00 TiB")
+
+    monkeypatch.setattr(runner, "compile_first", large)
+    status, said = run(1)
+    assert status == 1
+    assert said.splitlines()[-1].startswith("fathom: not enough memory (Unable to allocate 3.00 TiB); ")
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for the children in /proc")
 @pytest.mark.parametrize("interrupts", [1, 2])
