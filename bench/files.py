@@ -32,18 +32,23 @@ def writing(
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file under another name first, so that it is never there in part.
+    """Write a file under another name first, so that it is never there in part; it is on the disk when this returns.
 
     Raises:
         OSError: it cannot be written; then nothing of it is left.
     """
     unfinished = path.with_name(f"{path.name}.{os.getpid()}")
     try:
-        unfinished.write_bytes(content)
+        with unfinished.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
         unfinished.replace(path)
     except OSError:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
         raise
+    flush_folder(path.parent)
 
 
 def write_csv(table: pd.DataFrame, path: Path) -> None:
@@ -70,3 +75,13 @@ def _harmless(value: Any) -> Any:
         return value
     text = shown(value)
     return f"'{text}" if FORMULA.match(text) else text
+
+
+def flush_folder(folder: Path) -> None:
+    """Put on the disk which names a folder holds; do nothing where the system cannot flush folders."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -46,6 +46,7 @@ def run(
     spec, their log or a version has changed. Recorded logs are first checked for gross faults: gravity, units, axes,
     clocks, coordinates. What is found is printed and kept with the runs.
     """
+    from ..errors import ExperimentError, StoppedError
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
     from ..output.present import present, print_log
@@ -62,7 +63,12 @@ def run(
         outcome = sweep(
             plan, data, out, jobs, only, repair, force, dask, print_finished, check=not no_check, strict=strict
         )
-    present(outcome, plan, folder, printed)
+    try:
+        present(outcome, plan, folder, printed)
+    except ExperimentError as error:
+        if outcome.made:
+            raise StoppedError(str(error)) from None
+        raise
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run
         raise typer.Exit(BAD_INPUT)

@@ -31,12 +31,18 @@ class Verb(TyperCommand):
         try:
             with on_interrupt("interrupted"):
                 return super().invoke(ctx)
+        except MemoryError as error:
+            detail = f" ({error})" if str(error) else ""
+            refuse(
+                f"not enough memory{detail}; end other programs, or give less: fewer --jobs, a shorter log", SOME_FAILED
+            )
         except ValueError as error:
             from ...datasets.errors import FathomError
+            from ..errors import StoppedError
 
             if not isinstance(error, FathomError):
                 raise
-            refuse(" ".join(str(error).split()))
+            refuse(" ".join(str(error).split()), SOME_FAILED if isinstance(error, StoppedError) else BAD_INPUT)
 
 
 @contextmanager
@@ -49,10 +55,10 @@ def on_interrupt(message: str) -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def refuse(message: str) -> None:
-    """Print why nothing was run, and exit with status 2."""
+def refuse(message: str, status: int = BAD_INPUT) -> None:
+    """Print why nothing was run, or why it stopped, and exit."""
     say(f"fathom: {message}")
-    raise typer.Exit(BAD_INPUT) from None
+    raise typer.Exit(status) from None
 
 
 def say(message: str) -> None:

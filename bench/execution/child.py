@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import os
 import runpy
+import signal
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import Pipe
@@ -25,6 +27,8 @@ THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 
 STDERR = 2
 """File descriptor."""
+PR_SET_PDEATHSIG = 1
+"""Of Linux's prctl(2): the signal that a process gets when its parent ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,19 @@ class Child:
 
     def __exit__(self, *_: object) -> None:
         self.kill()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ignore Ctrl-C inside the block: for the killing of children, which is short."""
+    if threading.current_thread() is not threading.main_thread():  # others get no signals
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
 
 
 def start(
@@ -84,10 +101,19 @@ def start(
 
 def main(descriptor: str, target: str, *arguments: str) -> None:
     """Be the child: call the target with the connection."""
+    _be_killed_with_parent()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     home, _, function = target.rpartition(":")
     found = runpy.run_path(home) if home.endswith(".py") else vars(import_module(home))
     found[function](Connection(int(descriptor)), *arguments)
+
+
+def _be_killed_with_parent() -> None:
+    """Ask Linux to kill this process as soon as its parent ends, even inside a long call; elsewhere do nothing."""
+    if sys.platform == "linux":
+        import ctypes
+
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _end_with_parent() -> None:

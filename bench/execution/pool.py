@@ -12,7 +12,7 @@ from multiprocessing.connection import wait
 from subprocess import TimeoutExpired
 from typing import TypeAlias
 
-from .child import Child, start
+from .child import Child, start, uninterrupted
 from .task import Finished, Task
 
 GRACE_S = 120.0
@@ -116,8 +116,9 @@ def run_all(tasks: Sequence[Task], jobs: int = 0) -> Generator[Finished]:
                     workers[workers.index(worker)] = Worker()
                 yield finished
     finally:
-        for worker in workers:
-            worker.child.kill()
+        with uninterrupted():
+            for worker in workers:
+                worker.child.kill()
 
 
 def _soonest(workers: Sequence[Worker]) -> float:

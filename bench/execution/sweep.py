@@ -18,21 +18,24 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ...datasets.described.opening import RecordingNotFound
-from ..errors import ExperimentError
+from ..errors import ExperimentError, StoppedError
 from ..experiment.plan import Experiment, Run
 from ..files import writing
 from ..inspection.findings.finding import Finding
-from ..results.identity import content_sha256
-from ..results.store import Row, Store, provenance, sole_writer
+from ..results.identity import FINAL, content_sha256
+from ..results.store import Row, Store, provenance, sole_writer, with_whole_specs
 from .cold_start import compile_first
 from .dask_pool import run_on_cluster
 from .log_check import Findings, check_log, note_of, report
 from .pool import run_all
-from .task import Task
+from .task import Finished, Task
 
 FIRST_SHARE = 0.1
 """An experiment's first log goes first where its runs are at most this share of the work, so that its table is there
 early. It costs little: the longest of the other runs begin a tenth of the time later at most."""
+
+WRITTEN = ("table.csv", "table.tex", "consistency.csv", "paired.csv", "report.html")
+"""Files that `fathom run` writes into the folder of an experiment, again each time."""
 
 LINE_EVERY_S = 10.0
 """Where there is no terminal, a line of progress comes at most this often: some twenty in a log of `make bench`."""
@@ -42,16 +45,18 @@ class Outcome(NamedTuple):
     """The result of a sweep.
 
     Attributes:
-        rows: of the store, one per run and output.
+        rows: of the store, one per run and output, as `Store.read` returns them.
         standing: number of runs that were in the store already.
         renewed: number of runs that were there under another identity and were repeated.
         kept: by a log's name, why it did not run; its earlier rows are kept.
+        made: number of runs that were made now.
     """
 
     rows: pd.DataFrame
     standing: int
     renewed: int
     kept: dict[str, str]
+    made: int = 0
 
 
 def run_experiment(
@@ -67,7 +72,9 @@ def run_experiment(
     strict: bool = False,
 ) -> pd.DataFrame:
     """Run every estimator on every log and return the rows of the store, one per run and output; see `sweep`."""
-    return sweep(experiment, data, out, jobs, only, repair, force, dask, check=check, strict=strict).rows
+    return with_whole_specs(
+        sweep(experiment, data, out, jobs, only, repair, force, dask, check=check, strict=strict).rows
+    )
 
 
 def sweep(
@@ -105,6 +112,7 @@ def sweep(
 
     Raises:
         ExperimentError, EstimatorError, DatasetError: nothing was run.
+        StoppedError: a result could not be kept, as on a full disk; those before it are in the store.
     """
     if not isinstance(experiment, Experiment):
         experiment = Experiment.load(experiment)
@@ -121,7 +129,8 @@ def sweep(
     _make_room(folder)
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
-        missing, renewed = _missing(tasks, store, force)
+        rows = store.read()
+        missing, renewed = _missing(tasks, rows, force)
         left = Counter(task.run.log.name for task in missing)
         progress = _Progress(len(missing))
         for batch in _batches(missing, duration_s):
@@ -130,16 +139,16 @@ def sweep(
             ended = run_all(batch, jobs) if dask is None else run_on_cluster(batch, dask, jobs, progress.say)
             with progress, closing(ended):
                 for each in ended:
-                    rows = each.keep(folder)
-                    store.write(rows)
-                    progress.advance(rows)
-                    log = rows[0]["log"]
+                    progress.advance(_keep(each, store, folder))
+                    log = each.rows[0]["log"]
                     left[log] -= 1
                     if finished_log is not None and left[log] == 0:
                         progress.clear()
                         finished_log(rows_of(store.read(log), runs))
-        _sweep(folder / "trajectories", store.trajectories())
-        return Outcome(rows_of(store.read(), runs), len(tasks) - len(missing), renewed, kept)
+        _sweep(folder / "trajectories", store)
+        if missing or absent:
+            rows = store.read()
+        return Outcome(rows_of(rows, runs), len(tasks) - len(missing), renewed, kept, len(missing))
 
 
 def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[Task]]:
@@ -166,9 +175,20 @@ def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[T
     return [[t for t in ordered if t.run.log.name == first], [t for t in ordered if t.run.log.name != first]]
 
 
-def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Task], int]:
+def _keep(finished: Finished, store: Store, folder: Path) -> list[Row]:
+    """Write a finished run's trajectories, then its rows, and return these."""
+    try:
+        store.announce(finished.files)
+        store.write(finished.keep(folder))
+    except ExperimentError as error:
+        raise StoppedError(str(error)) from None
+    return finished.rows
+
+
+def _missing(tasks: Sequence[Task], rows: pd.DataFrame, force: bool) -> tuple[list[Task], int]:
     """Return the tasks that are not in the store yet, and how many of them are there under another identity."""
-    finished = store.finished()
+    final = rows.loc[rows["status"].isin(FINAL), ["log", "label", "seed", "identity"]].astype(object)
+    finished = set(final.where(final.notna(), None).itertuples(index=False, name=None))
     named = {key[:3] for key in finished}
     missing, renewed = [], 0
     for task in tasks:
@@ -180,19 +200,33 @@ def _missing(tasks: Sequence[Task], store: Store, force: bool) -> tuple[list[Tas
     return missing, renewed
 
 
-def _sweep(folder: Path, spoken_of: set[str]) -> None:
-    """Remove the files of runs that were killed or repeated."""
+def _sweep(folder: Path, store: Store) -> None:
+    """Remove the files of runs that were killed or repeated; nothing that this store did not write."""
+    announced, left = store.files()
     for path in folder.iterdir():
-        if path.name not in spoken_of and (path.suffix == ".parquet" or ".parquet." in path.name):
-            path.unlink(missing_ok=True)
+        whole, _, process = path.name.rpartition(".")
+        if path.name in left or (process.isdecimal() and whole in announced):  # the latter was killed in mid-write
+            try:
+                path.unlink()
+            except OSError:  # it can go the next time
+                left.discard(path.name)
+    store.forget(left)
 
 
 def _make_room(folder: Path) -> None:
     """Make the folders of the results, before anything runs.
 
     Raises:
-        ExperimentError: they cannot be made, or something else is at a result's path.
+        ExperimentError: they cannot be made, or something else is at a result's path: what no run here wrote is not
+            written over.
     """
+    if not (folder / "runs.sqlite").exists():
+        for path in (*(folder / name for name in WRITTEN), *(folder / "figures").glob("*")):
+            if path.exists():
+                raise ExperimentError(
+                    f"{path}: is there, but no runs.sqlite beside it, so no run here wrote it; move it away, or give "
+                    "another --out"
+                )
     for path in (folder / "trajectories", folder / "figures"):  # the lock lies in their parent
         with writing(path, "; give another --out", "made"):
             path.mkdir(parents=True, exist_ok=True)
@@ -271,7 +305,8 @@ def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
     def is_old(row: Any) -> bool:
         if not isinstance(row.spec, str) or not isinstance(row.versions, str):
             return True
-        spec, seed = json.loads(row.spec), None if pd.isna(row.seed) else int(row.seed)
+        seed = None if pd.isna(row.seed) else int(row.seed)
+        spec = json.loads(row.spec) | {"seed": seed}
         today = experiment.spec(runs[row.log, row.label, seed], spec.get("repair", False))
         as_text = [json.dumps(one, sort_keys=True) for one in (spec, today)]
         return as_text[0] != as_text[1] or json.loads(row.versions) != versions

@@ -22,6 +22,9 @@ from ..metrics.scoring import Scoring
 from ..results.identity import identity
 from ..results.store import Row, provenance
 
+PART_BYTES = 80
+"""Of a name of a log or an estimator in the name of a file, which holds both and has 255 bytes at most."""
+
 
 @dataclass(frozen=True)
 class Task:
@@ -147,5 +150,5 @@ def parquet(trajectory: Trajectory) -> bytes:
 
 def _file_part(text: str) -> str:
     """Return the text as a file name may hold it; a changed text gains a few letters of its own."""
-    safe = re.sub(r"[^\w.=+-]+", "_", text)
-    return safe if safe == text else f"{safe}-{sha256(text.encode()).hexdigest()[:4]}"
+    safe = re.sub(r"[^\w.=+-]+", "_", text).encode()[:PART_BYTES].decode(errors="ignore")
+    return safe if safe == text else f"{safe}-{sha256(text.encode(errors='backslashreplace')).hexdigest()[:4]}"

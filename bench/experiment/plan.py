@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -136,10 +137,16 @@ class Experiment(Settings):
             "repair": repair,
             "estimator": {"name": run.estimator.name, "config": run.estimator.config},
             "seed": run.seed,
-            "scores": plain(self.scoring(run.log)),
+            "scores": _plain_scores(self.scoring(run.log)),
             "max_gap_s": self.max_gap_s,
             "timeout_s": self.timeout_s,
         }
+
+
+@lru_cache
+def _plain_scores(scoring: Scoring) -> dict[str, Any]:
+    """Return what every run's spec says of the scores; all runs share it."""
+    return plain(scoring)
 
 
 def find_experiment(name_or_path: str | Path) -> Path:

@@ -137,14 +137,18 @@ def anees(values: Array, dof: int, t_s: Array) -> Average:
 
 def anees_of(runs: Sequence[str | None]) -> dict[Block, Average]:
     """Average the results of `nees_at` over seeds, given as JSON from the store; blocks without a run are left out."""
-    every: list[dict[str, list[float | None]]] = [of_run for run in runs if run and (of_run := json.loads(run))]
+    every = [
+        {name: np.array(values, float) for name, values in json.loads(run).items()}
+        for run in runs
+        if run not in (None, "", "{}")
+    ]
     usual = Counter(len(run["t_s"]) for run in every).most_common(1)
     every = [run for run in every if len(run["t_s"]) == usual[0][0]]  # leaves out runs with another number of times
     found: dict[Block, Average] = {}
     for block in BLOCKS:
         of_block = [run for run in every if block in run]
         if of_block:
-            values, times = (np.array([run[name] for run in of_block], float) for name in (block, "t_s"))
+            values, times = (np.stack([run[name] for run in of_block]) for name in (block, "t_s"))
             first = [next((t for t in column if not np.isnan(t)), np.nan) for column in times.T]
             found[block] = anees(values, DOF[block], np.array(first))
     return {block: average for block, average in found.items() if len(average)}
@@ -155,7 +159,8 @@ def pooled_nis(runs: Sequence[Mapping[str, Any]]) -> dict[str, Average]:
     total: dict[str, list[tuple[float, int]]] = {}
     for run in runs:
         for sensor, dof in json.loads(run["nis_dof"] or "{}").items():
-            total.setdefault(sensor, []).append((run[f"nis_{sensor}"] * dof, dof))
+            if (nis := run.get(f"nis_{sensor}")) is not None:
+                total.setdefault(sensor, []).append((nis * dof, dof))
     found = {}
     for sensor, each in total.items():
         sums, dofs = (np.array(column) for column in zip(*each, strict=True))

@@ -74,7 +74,20 @@ def _track(row: Record, folder: Path) -> Track | None:
 
 
 def load_trajectory(path: Path) -> Trajectory:
-    """Read a saved trajectory; of its covariance the 3 × 3 blocks are kept, the rest is NaN."""
+    """Read a saved trajectory; of its covariance the 3 × 3 blocks are kept, the rest is NaN.
+
+    Raises:
+        ValueError: it cannot be read: it is damaged, or there is not enough memory for it.
+    """
+    try:
+        return _loaded(path)
+    except MemoryError as error:
+        raise ValueError(f"there is not enough memory to read it ({error})") from None
+    except Exception as error:  # pandas and pyarrow raise many kinds for a file that is not what it seems
+        raise ValueError(one_line(error)) from None
+
+
+def _loaded(path: Path) -> Trajectory:
     table = pd.read_parquet(path)
     if COVARIANCE[0, 0] in table:
         table = table.reindex(columns=[*table.columns, *(name for name in COVARIANCE.values() if name not in table)])

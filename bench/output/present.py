@@ -15,7 +15,7 @@ from ..experiment.plan import Experiment
 from ..files import writing
 from ..results.paired import paired
 from ..results.store import load_runs
-from ..results.summary import Record
+from ..results.summary import Record, Records, Rows, groups, records
 from .remarks import absence
 from .tables import terminal
 from .tables.latex import write_latex
@@ -62,16 +62,17 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     if set(rows["status"]) == {"absent"}:
         print_remarks(rows, terminal.console())
         return
-    every = rows_of(load_runs(folder), plan.runs())
-    others = every.loc[~every["identity"].isin(rows["identity"])]
+    stored = rows_of(load_runs(folder, shared_specs=True), plan.runs()) if _lacks_runs(rows, plan) else rows
+    others = stored.loc[~stored["identity"].isin(rows["identity"])]
     old = others.index[outdated(others, plan)]
-    every = every.drop(old)
+    made = records(rows)
+    every = made if stored is rows else records(stored.drop(old))
+    shown = set(groups(made, "log", "label"))
     console = terminal.console()
-    print_logs(rows.loc[~rows["log"].isin(list(printed))], console)
+    print_logs(Records(row for row in made if row["log"] not in printed) if printed else made, console)
     differences = paired(every, plan.comparisons(), plan.compare)
-    shown = set(zip(rows["log"], rows["label"], strict=True))
     print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
-    print_remarks(rows, console)
+    print_remarks(made, console)
     with writing(folder, "; the runs are in runs.sqlite"):
         write_table(every, folder / "table.csv")
         write_latex(every, folder / "table.tex")
@@ -90,7 +91,14 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
         say(f"{absence(log, cause)}; its rows are from an earlier run")
 
 
-def _draw_figures(rows: pd.DataFrame, folder: Path, differences: list[Record]) -> int:
+def _lacks_runs(rows: pd.DataFrame, plan: Experiment) -> bool:
+    """Return whether the plan has runs besides those of these rows: `--only` asks for some of them."""
+    seeds = (None if pd.isna(seed) else int(seed) for seed in rows["seed"])
+    there = set(zip(rows["log"], rows["label"], seeds, strict=True))
+    return not {(run.log.name, run.estimator.label, run.seed) for run in plan.runs()} <= there
+
+
+def _draw_figures(rows: Rows, folder: Path, differences: list[Record]) -> int:
     """Draw all figures and return how many files they are; matplotlib takes a second to load, so it waits till here."""
     with Console(stderr=True).status("drawing figures") as status:
         from .figures.figures import draw_figures
@@ -105,7 +113,7 @@ def _draw_figures(rows: pd.DataFrame, folder: Path, differences: list[Record]) -
     return len(files)
 
 
-def _write_report(rows: pd.DataFrame, plan: Experiment, folder: Path, differences: list[Record]) -> None:
+def _write_report(rows: Rows, plan: Experiment, folder: Path, differences: list[Record]) -> None:
     """Write report.html, or say how to get it; the plan goes beside it."""
     with Console(stderr=True).status("writing report.html"):
         from .report.page import NoExtraError, write_report

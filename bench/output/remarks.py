@@ -9,6 +9,7 @@ from textwrap import shorten
 
 from ..results.summary import Record, ended_at_gap, groups
 
+NO_CAUSE = "no cause is recorded"
 CAUSE_WIDTH = 160
 """Letters of a cause that a line shows: two lines of a terminal of 80 columns."""
 
@@ -23,13 +24,14 @@ def failures(rows: Sequence[Record]) -> list[str]:
             of_seed = "" if seed is None else f" seed {seed}"
             when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
             part = "; scored up to there" if ended_at_gap(row) else ""
-            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {shorten(row['cause'], CAUSE_WIDTH)}{part}")
+            why = shorten(row["cause"] or NO_CAUSE, CAUSE_WIDTH)
+            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {why}{part}")
     return list(dict.fromkeys(lines))
 
 
-def absence(log: str, cause: str) -> str:
+def absence(log: str, cause: str | None) -> str:
     """Return that a log's recording is not here and why, with its name once: a cause may begin with the name."""
-    return f"{log}: {cause.replace(f'not here: {log}: ', 'not here: ', 1)}"
+    return f"{log}: {(cause or NO_CAUSE).replace(f'not here: {log}: ', 'not here: ', 1)}"
 
 
 def mostly_outside(rows: Sequence[Record]) -> list[str]:

@@ -37,9 +37,6 @@ Done = Mapping[tuple[Any, ...], Sequence[Record]]
 SHORT = {"position": "pos", "attitude": "att", "velocity": "vel", "biases": "bias", "heading": "head"}
 """What narrow columns call blocks and sensors; others have their own names."""
 
-SHOWN_OF_IDENTITY = 8
-"""Letters of a run's identity that a table shows: enough to tell millions of runs apart."""
-
 
 UNITS = {column.unit for column in KNOWN.values()}
 
@@ -62,7 +59,6 @@ class Line(NamedTuple):
         output, lag: which output, in words and in short; empty in a table over all outputs.
         lookahead_s: what outputs are sorted by; None goes last.
         section: the score or the log that it is about, in a table of several.
-        run: its place among all rows of the store, in the table of runs.
     """
 
     name: str
@@ -71,7 +67,6 @@ class Line(NamedTuple):
     lag: str = ""
     lookahead_s: float | None = None
     section: str = ""
-    run: int | None = None
 
 
 @dataclass(frozen=True)
@@ -287,28 +282,6 @@ def cost(summary: Sequence[Record]) -> Sheet | None:
 
 
 NOT_COMPARABLE = "costs are not comparable: NIS was asked for, which cuts every step in two"
-
-
-def every_run(rows: Sequence[Record]) -> Sheet:
-    """Return every run with its scores, and the first letters of its identity."""
-    places = {id(row): place for place, row in enumerate(rows)}
-    lines = [
-        _line(
-            row,
-            [
-                Cell(ABSENT if row["seed"] is None else f"{row['seed']:.0f}", row["seed"]),
-                Cell(row["status"] or ABSENT, row["status"]),
-                *(cell(each.score, row) for each in ACCURACY),
-                Cell((row["identity"] or ABSENT)[:SHOWN_OF_IDENTITY], row["identity"]),
-            ],
-            section=row["log"],
-            run=places[id(row)],
-        )
-        for row in rows
-    ]
-    note = ["one by one, not pooled; a row opens to its spec, its counts and where it was made"]
-    headings = ["estimator", "seed", "status", *(each.heading for each in ACCURACY), "identity"]
-    return Sheet("Every run", note, headings, lines, "log")
 
 
 # -- paired differences -----------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ another run.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from hashlib import sha256
@@ -22,6 +22,9 @@ import numpy as np
 COMPUTES_WITH = ("fathom-bench", "numpy", "scipy", "numba", "gtsam", "filterpy", "pandas")
 FINAL = ("done", "diverged")
 """Statuses of runs that are not repeated; a failed one (its worker died, it was out of time) is."""
+NO_ROOMS = ("__pycache__", "fathom")
+"""Folders that hold none of our modules; `bench/fathom` is the package `fathom` itself, which lies above the three when
+they are installed."""
 
 
 @cache
@@ -39,15 +42,28 @@ def versions() -> dict[str, str]:
 @cache
 def code_sha256() -> str:
     """Return the hash of the source files of our three packages, by name and content."""
+    return sources_sha256(Path(__file__).parents[2])
+
+
+def sources_sha256(root: Path) -> str:
+    """Return the hash of the modules of our packages below `root`: of a checkout and of its installed wheel the same.
+
+    Other files there do not count: caches, checkpoints, an editor's copies, what was built inside the checkout.
+    """
     digest = sha256()
     for package in ("bench", "datasets", "estimators"):
-        sources = sorted((Path(__file__).parents[2] / package).rglob("*.py"))
-        for path in (path for path in sources if "__pycache__" not in path.parts):  # it may hold wrappers of a profile
-            digest.update(
-                f"{package}/{path.as_posix().rpartition(f'/{package}/')[2]}".encode()
-                + sha256(path.read_bytes()).digest()
-            )
+        for path in _modules(root / package):
+            digest.update(path.relative_to(root).as_posix().encode() + sha256(path.read_bytes()).digest())
     return digest.hexdigest()
+
+
+def _modules(folder: Path) -> Iterator[Path]:
+    """Yield the files below a folder that can be imported as modules of its package, in order."""
+    for path in sorted(folder.iterdir()):
+        if path.suffix == ".py" and path.stem.isidentifier() and path.is_file():
+            yield path
+        elif path.name.isidentifier() and path.name not in NO_ROOMS and (path / "__init__.py").is_file():
+            yield from _modules(path)
 
 
 def content_sha256(value: Any) -> str:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-import pandas as pd
 
 from ..metrics.bootstrap import bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS
 from ..metrics.scoring import POOLED
 from .paired import TAKE
-from .summary import Record, groups, records, summarise
+from .summary import Record, Rows, groups, has_score, records, summarise
 
 RESAMPLES = 1999
 """A thousand or more are customary for such intervals; of 1999, sorted, the 50th is the end at 2.5 %."""
@@ -31,6 +30,8 @@ def interval_over_seeds(done: Sequence[Record], score: str) -> tuple[float, floa
         score: one of `paired.OVER_SEEDS`.
     """
     known = [row for row in done if row[score] is not None]
+    if not all(has_score(row, score) for row in known):
+        return None
     weights = tuple(float(row[POOLED[score]]) if score in POOLED else 1.0 for row in known)
     return _interval(tuple(float(row[score]) for row in known), weights, score)
 
@@ -46,11 +47,11 @@ def _interval(values: tuple[float, ...], weights: tuple[float, ...], score: str)
     )
 
 
-def summarise_with_intervals(rows: pd.DataFrame) -> list[Record]:
+def summarise_with_intervals(rows: Rows) -> list[Record]:
     """Return what `summarise` does, and `<score>_low`, `<score>_high` for each score of TABLED: None with few seeds."""
-    done = [row for row in records(rows) if row["status"] == "done"]
-    by_output = groups(done, "log", "label", "output")
-    summary = summarise(rows)
+    every = records(rows)
+    by_output = groups((row for row in every if row["status"] == "done"), "log", "label", "output")
+    summary = [dict(record) for record in summarise(every)]
     for record in summary:
         of_output = by_output.get((record["log"], record["label"], record["output"]), [])
         for score in TABLED:

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import scipy  # its stats load when they are first asked for
 
 from ...datasets.state import Array
@@ -18,7 +17,7 @@ from ..metrics.association import ScoreError
 from ..metrics.bootstrap import FEWEST_SEEDS, bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS, Comparison, Over
 from ..metrics.scoring import POOLED
-from .summary import Record, groups, records
+from .summary import Record, Rows, groups, has_score, records
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,7 @@ PAIRED = (
 """Columns of `paired`."""
 
 
-def paired(rows: pd.DataFrame, comparisons: Sequence[Comparison], scores: Sequence[str]) -> list[Record]:
+def paired(rows: Rows, comparisons: Sequence[Comparison], scores: Sequence[str]) -> list[Record]:
     """Return one record per comparison, output and score: a `Difference`, None where there is nothing to compare.
 
     Each output is compared with the baseline's output of the same name; a smoothed one, where the baseline has none,
@@ -228,7 +227,7 @@ def _of_score(own: Sequence[Record], other: Sequence[Record], score: str) -> Rec
     both = [
         (mine[seed], theirs[seed])
         for seed in mine
-        if all(seed in of and of[seed]["status"] == "done" and of[seed][score] is not None for of in (mine, theirs))
+        if all(seed in of and of[seed]["status"] == "done" and has_score(of[seed], score) for of in (mine, theirs))
     ]
     if not both:
         return {"pairs": 0}

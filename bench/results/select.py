@@ -13,6 +13,7 @@ from typing import Any
 from ...datasets.errors import nearest
 from ..errors import ExperimentError
 from .machine import DECIDES
+from .rows import whole_spec
 from .store import load_runs
 from .summary import Record, groups, records
 
@@ -48,7 +49,8 @@ class Stored:
     @cached_property
     def spec(self) -> dict[str, Any]:
         """Everything that the run's numbers depend on, except readings and versions."""
-        return json.loads(self.first["spec"] or "{}")
+        seed = self.first["seed"]
+        return json.loads(whole_spec(self.first["spec"], None if seed is None else int(seed)) or "{}")
 
     @cached_property
     def made_by(self) -> dict[str, Any]:
@@ -77,7 +79,7 @@ def choose(folder: Path, row: str | None = None) -> list[Stored]:
     Raises:
         ExperimentError: no store, an empty one, or nothing of that name; or letters that several runs begin with.
     """
-    by_name = groups(records(load_runs(folder)), "log", "label", "seed")
+    by_name = groups(records(load_runs(folder, shared_specs=True)), "log", "label", "seed")
     runs = [Stored(tuple(rows)) for rows in by_name.values()]
     if not runs:
         raise ExperimentError(f"{folder}: no runs in it yet; `fathom run` makes them")

@@ -88,4 +88,4 @@ def pooled_steps(rows: Iterable[Mapping[str, Any]]) -> StepTimes | None:
     for row in known:
         for k, n in json.loads(row["step_histogram"]).items():
             counts[int(k)] += n
-    return StepTimes(counts, max(row["step_max_us"] for row in known), len(known)) if counts.any() else None
+    return StepTimes(counts, max(row["step_max_us"] or 0.0 for row in known), len(known)) if counts.any() else None

@@ -5,60 +5,23 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from ..errors import ExperimentError
 from ..files import writing
-from ..metrics.floor_ratio import FLOORS
-from ..metrics.scoring import COSTS, INNOVATIONS, SCORES
-from .identity import FINAL, versions
+from .identity import versions
 from .machine import git, machine
+from .rows import COLUMNS, NAMES, OtherColumnsError, Row, check_columns, read_rows, whole_spec
 
-Row = Mapping[str, Any]
-
-NAMES = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER", "output": "TEXT"}
-"""Columns that name a row: seed is NULL for a recorded log; output is "online" or "smoothed"."""
-
-OUTCOME = {
-    "status": "TEXT",  # done, diverged, failed, absent
-    "cause": "TEXT",
-    "failed_at_s": "REAL",
-    "lookahead_s": "REAL",
-    "truth_kind": "TEXT",
-    "align": "TEXT",
-    "dims": "TEXT",
-    "duration_s": "REAL",
-    "start": "TEXT",  # where the prior came from: "given", "static", "moving", ...
-}
-HONESTY = {
-    "nees_at": "TEXT",  # JSON: NEES by block at times fixed beforehand, see `consistency.nees_at`
-    "nis_dof": "TEXT",  # JSON: degrees of freedom of each sensor's NIS
-}
-TIMES = {
-    "step_histogram": "TEXT",  # JSON: how many steps took how long, see `step_time.step_histogram`
-}
-ORIGIN = {
-    "identity": "TEXT",  # see `identity`
-    "estimator": "TEXT",
-    "spec": "TEXT",  # JSON
-    "counts": "TEXT",  # JSON
-    "notes": "TEXT",  # JSON: a list, see `datasets.notes.as_data`
-    "missing": "TEXT",  # JSON: why scores are not there, {reason: [score, ...]}
-    "trajectory": "TEXT",  # file under trajectories/
-    "truth_trajectory": "TEXT",  # likewise, at the same times
-    "started": "TEXT",
-    "finished": "TEXT",
-    "commit_id": "TEXT",
-    "versions": "TEXT",  # JSON
-    "machine": "TEXT",  # JSON
-}
-COLUMNS = NAMES | OUTCOME | dict.fromkeys([*SCORES, *FLOORS, *INNOVATIONS, *COSTS], "REAL") | HONESTY | TIMES | ORIGIN
+LOCKED_S = 60.0
+"""s to wait for a program that writes to the store at this moment: transactions are short."""
 SAME_RUN = "experiment IS :experiment AND log IS :log AND label IS :label AND seed IS :seed"
 
 
@@ -66,26 +29,21 @@ class Store:
     """The rows of one experiment.
 
     Raises:
-        ExperimentError: the file is there and is not such a store, or has other columns.
+        ExperimentError: the file is there and is not such a store, has other columns, or cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self.connection = sqlite3.connect(path, timeout=60)
+            self.connection = sqlite3.connect(path, timeout=LOCKED_S)
         except (OSError, sqlite3.Error) as error:
             raise ExperimentError(f"{path}: cannot be written ({error}); give another --out") from None
         try:
             self._prepare()
-        except _OtherColumnsError as error:
-            self.connection.close()
-            raise ExperimentError(f"{path}: {error}") from None
         except sqlite3.Error as error:
             self.connection.close()
-            raise ExperimentError(
-                f"{path}: not a store of runs ({error}); move it away, or give another --out"
-            ) from None
+            raise ExperimentError(f"{path}: {_why(error)}") from None
 
     def _prepare(self) -> None:
         run = self.connection.execute
@@ -93,8 +51,20 @@ class Store:
         run("PRAGMA synchronous = FULL")
         with self.connection:
             run(f"CREATE TABLE IF NOT EXISTS runs ({', '.join(f'{name} {kind}' for name, kind in COLUMNS.items())})")
-            _check_columns(self.connection)
+            check_columns(self.connection)
             run("CREATE UNIQUE INDEX IF NOT EXISTS one_row ON runs (experiment, log, label, ifnull(seed, -1), output)")
+            run("CREATE TABLE IF NOT EXISTS files (name TEXT PRIMARY KEY)")
+
+    @contextmanager
+    def _told(self, advice: str = "; the runs before are kept") -> Iterator[None]:
+        """Raise ExperimentError where the file cannot be used any more."""
+        try:
+            with self.connection:
+                yield
+        except sqlite3.IntegrityError:
+            raise
+        except sqlite3.Error as error:
+            raise ExperimentError(f"{self.path}: cannot write ({error}){advice}") from None
 
     def write(self, rows: Sequence[Row]) -> None:
         """Replace the rows of an earlier run of the same name by these, in one transaction.
@@ -102,16 +72,13 @@ class Store:
         Raises:
             ExperimentError: the disk is full, or the file cannot be written.
         """
-        try:
-            with self.connection:
-                for row in rows:
-                    self.connection.execute(f"DELETE FROM runs WHERE {SAME_RUN}", {key: row[key] for key in NAMES})
-                for row in rows:
-                    names = ", ".join(row)
-                    values = ", ".join(f":{name}" for name in row)
-                    self.connection.execute(f"INSERT INTO runs ({names}) VALUES ({values})", dict(row))
-        except sqlite3.OperationalError as error:
-            raise ExperimentError(f"{self.path}: cannot write ({error}); the runs before are kept") from None
+        with self._told():
+            for row in rows:
+                self.connection.execute(f"DELETE FROM runs WHERE {SAME_RUN}", {key: row[key] for key in NAMES})
+            for row in rows:
+                values = {name: _storable(value) for name, value in row.items()}
+                marks = ", ".join(f":{name}" for name in values)
+                self.connection.execute(f"INSERT INTO runs ({', '.join(values)}) VALUES ({marks})", values)
 
     def write_absent(self, row: Row) -> bool:
         """Add the row of a run that could not be made; do nothing and return False if it has earlier rows."""
@@ -122,20 +89,37 @@ class Store:
         self.write([row])
         return True
 
-    def finished(self) -> set[tuple[str, str, int | None, str | None]]:
-        """Return log, label, seed and identity of every run that is done or diverged."""
-        final = ", ".join(f"'{status}'" for status in FINAL)
-        query = f"SELECT DISTINCT log, label, seed, identity FROM runs WHERE status IN ({final})"
-        return set(self.connection.execute(query))
+    def announce(self, files: Iterable[str]) -> None:
+        """Note the names of trajectory files before they are written: only such files are ever removed.
 
-    def trajectories(self) -> set[str]:
-        """Return the names of the trajectory files that rows refer to."""
-        query = "SELECT trajectory FROM runs UNION SELECT truth_trajectory FROM runs"
-        return {name for (name,) in self.connection.execute(query) if name is not None}
+        Raises:
+            ExperimentError: as `write`.
+        """
+        with self._told():
+            self.connection.executemany("INSERT OR IGNORE INTO files VALUES (?)", [(name,) for name in files])
+
+    def files(self) -> tuple[set[str], set[str]]:
+        """Return the names of all files that were announced, and of those that no row refers to."""
+        with self._told():
+            known = {name for (name,) in self.connection.execute("SELECT name FROM files")}
+            query = "SELECT trajectory FROM runs UNION SELECT truth_trajectory FROM runs"
+            return known, known - {name for (name,) in self.connection.execute(query)}
+
+    def forget(self, files: Iterable[str]) -> None:
+        """Forget the names of files that were removed."""
+        with self._told():
+            self.connection.executemany("DELETE FROM files WHERE name = ?", [(name,) for name in files])
 
     def read(self, log: str | None = None) -> pd.DataFrame:
-        """Return every row, or those of one log, in the order in which they were written."""
-        return read_rows(self.connection, log)
+        """Return every row, or those of one log, in the order in which they were written; see `read_rows`.
+
+        Raises:
+            ExperimentError: the file cannot be read.
+        """
+        try:
+            return read_rows(self.connection, log)
+        except sqlite3.Error as error:
+            raise ExperimentError(f"{self.path}: cannot be read ({error})") from None
 
     def close(self) -> None:
         """Merge the write-ahead log into the file and close it."""
@@ -148,34 +132,30 @@ class Store:
         self.close()
 
 
-class _OtherColumnsError(sqlite3.DatabaseError):
-    """The table `runs` is not of this version; says what to do."""
+def _storable(value: Any) -> Any:
+    """Return a value as SQLite takes it: a number of Python's, a text without lone surrogates."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    return value.item() if isinstance(value, np.generic) else value
 
 
-def _check_columns(connection: sqlite3.Connection) -> None:
-    there = {row[1] for row in connection.execute("PRAGMA table_info(runs)")}
-    if not there:
-        raise sqlite3.DatabaseError("no table `runs` in it")
-    for what, names in (("lacks", COLUMNS.keys() - there), ("has an unknown", there - COLUMNS.keys())):
-        if names:
-            raise _OtherColumnsError(
-                f"another version wrote it: it {what} column {min(names)}; read it with that version, or move it away "
-                "and run the experiment again"
-            )
+def _why(error: sqlite3.Error) -> str:
+    """Return why a file cannot be opened as a store to write to, and what to do."""
+    if isinstance(error, OtherColumnsError):
+        return str(error)
+    if not isinstance(error, sqlite3.OperationalError):
+        return f"not a store of runs ({error}); move it away, or give another --out"
+    if "locked" in str(error):
+        return f"another program has it open to write ({error}); wait for it, or give another --out"
+    return f"cannot be written ({error}); mend that, or give another --out"
 
 
-def read_rows(connection: sqlite3.Connection, log: str | None = None) -> pd.DataFrame:
-    """Return the rows of an open store, or those of one log."""
-    _check_columns(connection)
-    chosen = "" if log is None else "WHERE log IS :log"
-    query = f"SELECT {', '.join(COLUMNS)} FROM runs {chosen} ORDER BY rowid"
-    table = pd.DataFrame(connection.execute(query, {"log": log}).fetchall(), columns=list(COLUMNS))
-    numbers = [name for name, kind in COLUMNS.items() if kind == "REAL"]
-    return table.astype(dict.fromkeys(numbers, "float64") | {"seed": "Int64"})
-
-
-def load_runs(folder: Path | str) -> pd.DataFrame:
+def load_runs(folder: Path | str, shared_specs: bool = False) -> pd.DataFrame:
     """Return the rows of the experiment in `folder`, read only.
+
+    Args:
+        folder: holds runs.sqlite.
+        shared_specs: leave the seeds out of the specs, which takes a third of the memory; see `read_rows`.
 
     Raises:
         ExperimentError: no store there, or it cannot be read.
@@ -186,12 +166,19 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
     alone = not os.access(path.parent, os.W_OK) and not path.with_name(f"{path.name}-wal").exists()
     try:  # SQLite reads a store with a write-ahead log by writing beside it, unless told that nobody changes it
         uri = f"{path.resolve().as_uri()}{'?immutable=1' if alone else ''}"
-        with closing(sqlite3.connect(uri, uri=True)) as connection:
-            return read_rows(connection)
-    except _OtherColumnsError as error:
+        with closing(sqlite3.connect(uri, timeout=LOCKED_S, uri=True)) as connection:
+            rows = read_rows(connection)
+    except OtherColumnsError as error:
         raise ExperimentError(f"{path}: {error}") from None
     except sqlite3.Error as error:
         raise ExperimentError(f"{path}: cannot be read as a store of runs ({error})") from None
+    return rows if shared_specs else with_whole_specs(rows)
+
+
+def with_whole_specs(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows of a store with the seed in each spec."""
+    seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
+    return rows.assign(spec=pd.Series(map(whole_spec, rows["spec"], seeds), rows.index, object))
 
 
 @cache
@@ -231,7 +218,9 @@ def sole_writer(folder: Path) -> Iterator[None]:
             ) from None
         except OSError as error:
             raise ExperimentError(f"{path}: cannot be locked ({error.strerror}); give another --out") from None
-        with suppress(OSError):  # no room for our number, say: the lock holds without
-            handle.truncate(0)
-            handle.write(f"{os.getpid()}\n".encode("ascii"))
+        handle.seek(0)
+        if not handle.read(20).strip().strip(b"0123456789"):  # else it is somebody else's file, and stays as it is
+            with suppress(OSError):  # no room for our number, say: the lock holds without
+                handle.truncate(0)
+                handle.write(f"{os.getpid()}\n".encode("ascii"))
         yield

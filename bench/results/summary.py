@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import count
 from statistics import fmean, median
 from typing import Any, TypeAlias
@@ -24,6 +24,18 @@ Record: TypeAlias = dict[str, Any]
 """One row, absent values being None."""
 
 
+class Records(list[Record]):
+    """The rows of a table of runs, which nobody changes once they are made."""
+
+    @cached_property
+    def summary(self) -> list[Record]:
+        """What `summarise` returns of them: tables, figures and report all need it."""
+        return _summarise(self)
+
+
+Rows: TypeAlias = pd.DataFrame | Sequence[Record]
+"""A table of runs, or its `records`."""
+
 SAME = ("estimator", "lookahead_s", "truth_kind", "align", "dims")
 SEEDS_ENOUGH = 5
 """With fewer seeds the interval of ANEES is too wide to be useful, so only NIS, if requested, is tabulated."""
@@ -36,16 +48,22 @@ UNFINISHED = ("diverged", "failed", "absent")
 
 LONGEST_NAME = 100
 """Letters of a log's name in the name of a file, which has 255 at most, with what it is added to."""
+LARGEST = 1e150
+"""Of a score in any unit: its square is finite."""
 
 OUTLIERS = "outliers_"
 """Prefix of the counts of readings that an estimator rejected, or gave less weight, as outliers."""
 
 
-def records(rows: pd.DataFrame) -> list[Record]:
-    """Return the rows of a table of runs as plain Python."""
-    return [
-        {str(name): None if pd.isna(value) else value for name, value in row.items()} for row in rows.to_dict("records")
-    ]
+def records(rows: Rows) -> Records:
+    """Return the rows of a table of runs as plain Python; those that are already, unchanged."""
+    if isinstance(rows, Records):
+        return rows
+    if not isinstance(rows, pd.DataFrame):
+        return Records(rows)
+    columns = [column.astype(object).where(column.notna(), None).tolist() for _, column in rows.items()]
+    names = [str(name) for name in rows.columns]
+    return Records(dict(zip(names, values, strict=True)) for values in zip(*columns, strict=True))
 
 
 def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Record]]:
@@ -67,7 +85,7 @@ def file_names(names: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def summarise(rows: pd.DataFrame) -> list[Record]:
+def summarise(rows: Rows) -> list[Record]:
     """Return one record per log, estimator and output, over the seeds that finished; if none did, over those that ended
     at a gap of the IMU, each up to its gap.
 
@@ -77,12 +95,17 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
     freedom, with the number of those times at which it lies above and below its interval. `start` lists where the
     priors came from, `missing` says by a score's name why it is None.
     """
-    every = records(rows)
+    return records(rows).summary
+
+
+def _summarise(every: Records) -> list[Record]:
     ends = {
         key: [run[0]["status"] for run in groups(of, "seed").values()]
         for key, of in groups(every, "log", "label").items()
     }
-    counted = COUNTS | {name: name for name in _outliers(every)}
+    counts_of = {text: json.loads(text) for text in {row["counts"] or "{}" for row in every}}
+    names = {name for counts in counts_of.values() for name in counts if name.startswith(OUTLIERS)}
+    counted = COUNTS | {name: name for name in sorted(names)}
     summary = []
     for (log, label, output), group in groups(every, "log", "label", "output").items():
         done = [row for row in group if row["status"] == "done"]
@@ -100,7 +123,7 @@ def summarise(rows: pd.DataFrame) -> list[Record]:
         record |= {name: _over_seeds(median, scored, name) for name in MEDIAN}
         record |= _over_floor(scored)
         record |= _consistency(scored)
-        counts = [json.loads(row["counts"] or "{}") for row in scored]
+        counts = [counts_of[row["counts"] or "{}"] for row in scored]
         record |= {name: sum(run.get(of, 0) for run in counts) for name, of in counted.items()}
         record["missing"] = {name: why for name, why in _missing(scored).items() if record.get(name) is None}
         summary.append(record)
@@ -138,8 +161,15 @@ def _reasons(text: str) -> dict[str, list[str]]:
 
 
 def _pooled(done: Sequence[Record], name: str, n: str) -> float | None:
-    known = [row for row in done if row[name] is not None]
-    return pooled_rmse([row[name] for row in known], [row[n] for row in known]) if known else None
+    known = [row for row in done if row[name] is not None and row[n]]
+    with np.errstate(over="ignore"):  # the square of a run that got lost beyond all bounds
+        return pooled_rmse([row[name] for row in known], [row[n] for row in known]) if known else None
+
+
+def has_score(row: Record, name: str) -> bool:
+    """Return whether a row has a score that can be pooled: finite, as its square is, and with a weight."""
+    value = row[name]
+    return value is not None and abs(value) < LARGEST and (name not in POOLED or bool(row[POOLED[name]]))
 
 
 def _over_seeds(statistic: Callable[[list[float]], float], done: Sequence[Record], name: str) -> float | None:
@@ -152,6 +182,8 @@ def _over_floor(done: Sequence[Record]) -> Record:
     record: Record = {}
     for block, (score, floor) in OVER.items():
         known = [row for row in done if row[score] is not None and row[floor]]  # without a floor there is no ratio
+        if not all(has_score(row, name) for row in known for name in (score, floor)):
+            known = []
         squared_error, bound = (np.array([row[name] ** 2 for row in known]) for name in (score, floor))
         ratio = rmse_over_floor(squared_error, bound) if known else None
         for part, name in {"": "ratio", "_low": "low", "_high": "high"}.items():
@@ -177,7 +209,7 @@ def _consistency(done: Sequence[Record]) -> Record:
 CONSISTENCY = ("log", "label", "output", "score", "t_s", "seeds", "dof", "per_dof", "low", "high", "verdict")
 
 
-def consistency(rows: pd.DataFrame) -> list[Record]:
+def consistency(rows: Rows) -> list[Record]:
     """Return one record per ANEES (log, estimator, output, block, time) and per pooled NIS, with its interval."""
     table = []
     for (log, label, output), group in groups(records(rows), "log", "label", "output").items():
@@ -199,9 +231,3 @@ def is_judged(summary: Sequence[Record]) -> bool:
     """Return whether a table of consistency is worth showing: there is NIS, or ANEES over enough seeds."""
     enough = [row["done"] >= SEEDS_ENOUGH and row["anees_times"] is not None for row in summary]
     return any(enough) or any(row[name] is not None for row in summary for name in INNOVATIONS)
-
-
-def _outliers(rows: Iterable[Record]) -> list[str]:
-    """Return the names of the counts of outliers, over all runs."""
-    names = {name for row in rows for name in json.loads(row["counts"] or "{}") if name.startswith(OUTLIERS)}
-    return sorted(names)

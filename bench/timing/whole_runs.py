@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import time
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 from ...datasets import Scenario, simulate
 from ...estimators import create
@@ -81,18 +82,42 @@ def serve(connection: Any, duration: str) -> None:
 
 def finished_again_s() -> Measured:
     """Measure the processor time of `fathom run` on an experiment whose runs are all finished, s."""
-    cpu_s, wall_s, _ = _again(FINISHED)
-    return Measured((cpu_s,), f"processor time; {wall_s:.0f} s by the clock")
+    again = _again(FINISHED)
+    return Measured((again.cpu_s,), f"processor time; {again.wall_s:.0f} s by the clock")
 
 
 def finished_again_mb() -> Measured:
     """Measure the peak memory of the same command, MB."""
-    return Measured((_again(FINISHED)[2],))
+    return Measured((_again(FINISHED).peak_mb,))
+
+
+def page_of_finished_mb() -> Measured:
+    """Measure the size of the report that the same command writes, MB."""
+    return Measured((_again(FINISHED).page_mb,))
+
+
+class Again(NamedTuple):
+    """What the command took on finished runs: processor time and time, s, its peak memory and its report, MB."""
+
+    cpu_s: float
+    wall_s: float
+    peak_mb: float
+    page_mb: float
+
+
+MEASURED = """
+import json, resource, subprocess, sys
+done = subprocess.run([sys.executable, "-m", "fathom.bench.cli.app", *sys.argv[1:]])
+usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps([usage.ru_utime + usage.ru_stime, usage.ru_maxrss]))
+sys.exit(done.returncode)
+"""
+"""A small process between: on Linux a process begins with the peak of its parent's memory."""
 
 
 @cache
-def _again(n: int) -> tuple[float, float, float]:
-    """Return processor time, time (s) and peak memory (MB) of the command on n finished runs.
+def _again(n: int) -> Again:
+    """Run the command on n finished runs.
 
     One run is made. Its row and its trajectories stand for all others, under their own seeds and identities.
     """
@@ -108,23 +133,18 @@ def _again(n: int) -> tuple[float, float, float]:
             store.write(
                 [{**row, "seed": task.run.seed, "identity": task.identity, "spec": _spec(task)} for task in tasks]
             )
-        command = [sys.executable, "-m", "fathom.bench.cli.app", "run", str(file), "--out", temporary]
+        del tasks
+        command = [sys.executable, "-c", MEASURED, "run", str(file), "--out", temporary]
+        environment = os.environ | dict.fromkeys(THREAD_COUNTS, "1")
         started = time.perf_counter()
-        process = subprocess.Popen(
-            command,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | dict.fromkeys(THREAD_COUNTS, "1"),
-        )
-        assert process.stderr is not None
-        said = process.stderr.read()
-        _, status, usage = os.wait4(process.pid, 0)
-        assert os.waitstatus_to_exitcode(status) == 0, said
-        assert f"{n} " in said, said  # so many runs were finished already
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
         wall_s = time.perf_counter() - started
+        assert done.returncode == 0, done.stderr
+        assert f"{n} " in done.stderr, done.stderr  # so many runs were finished already
+        page_mb = (folder / "report.html").stat().st_size / 1e6
+    cpu_s, peak = json.loads(done.stdout.splitlines()[-1])
     unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux kilobytes
-    return usage.ru_utime + usage.ru_stime, wall_s, usage.ru_maxrss * unit / 1e6
+    return Again(cpu_s, wall_s, peak * unit / 1e6, page_mb)
 
 
 def _spec(task: Task) -> str:

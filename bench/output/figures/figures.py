@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import pandas as pd
 from matplotlib.figure import Figure
 
 from ....datasets.errors import one_line
 from ...drawing import Look, looks_of, save
-from ...results.summary import Record, file_names, groups, records, summarise
+from ...results.summary import Record, Rows, file_names, groups, records, summarise
 from ..estimates import tracks_of
 from .ablation import draw_ablation
 from .consistency import draw_nees
@@ -24,7 +23,7 @@ Tell = Callable[[int, int], None]
 
 
 def draw_figures(
-    rows: pd.DataFrame,
+    rows: Rows,
     folder: Path,
     differences: Sequence[Record] = (),
     tell: Tell = lambda done, total: None,
@@ -60,9 +59,10 @@ Found = list[tuple[Path, Callable[[], Figure]]]
 """The path of each figure, without suffix, and the function that draws it."""
 
 
-def _figures(rows: pd.DataFrame, folder: Path, differences: Sequence[Record], missing: list[str]) -> Found:
+def _figures(rows: Rows, folder: Path, differences: Sequence[Record], missing: list[str]) -> Found:
     """Return each figure that has data; what cannot be read is a sentence in `missing`."""
-    every, summary = records(rows), summarise(rows)
+    every = records(rows)
+    summary = summarise(every)
     looks = looks_of([label for (label,) in groups(every, "label")])
     stems = {log: folder / "figures" / name for log, name in file_names(row["log"] for row in every).items()}
     found: Found = []

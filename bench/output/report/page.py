@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from shlex import quote
 from typing import Any
-
-import pandas as pd
 
 from ....datasets.errors import shown
 from ...drawing import looks_of
 from ...errors import ExperimentError
 from ...files import write_whole, writing
 from ...results.store import load_runs
-from ...results.summary import Record, groups, records, summarise
+from ...results.summary import Record, Rows, groups, records, summarise
 from .. import cells, notices, sheets
 from ..remarks import mostly_outside, not_positive
 from . import curves, runs
+from .packing import embedded, packed, packed_text
 from .results import differences_of, in_order, kept_plan
 from .tracks import Drawn, draw_all
 
 HERE = Path(__file__).parent
+SCRIPTS = ("tables.js", "runs.js", "figures.js")
+POSES = 100_000
+"""Poses that a page may hold, 48 bytes each, 64 as base64: 6.4 MB."""
+POSES_OF_A_ROW = 4
+"""A row of the store takes as much of the page as so many poses: 250 bytes, compressed, as base64."""
+LEAST_POSES = 20_000
+"""That have room beside any number of rows."""
 
 
 class NoExtraError(ExperimentError):
@@ -42,15 +47,13 @@ def report(folder: Path, file: Path | None = None) -> Path:
         ExperimentError: no store there, an empty one, or the page cannot be written; NoExtraError without the extra.
     """
     check_extra()
-    rows = load_runs(folder)
+    rows = load_runs(folder, shared_specs=True)
     if rows.empty:
         raise ExperimentError(f"{folder / 'runs.sqlite'}: there is no run in it; `fathom run` makes them")
     return write_report(in_order(rows, folder), folder, differences_of(folder), file)
 
 
-def write_report(
-    rows: pd.DataFrame, folder: Path, differences: Sequence[Record] = (), file: Path | None = None
-) -> Path:
+def write_report(rows: Rows, folder: Path, differences: Sequence[Record] = (), file: Path | None = None) -> Path:
     """Write the page of these rows and return the file.
 
     Args:
@@ -79,7 +82,7 @@ def check_extra() -> None:
         raise NoExtraError(f"{error}; the report needs an extra: pip install 'fathom-bench[report]'") from None
 
 
-def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> str:
+def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
     """Return the page's HTML.
 
     Raises:
@@ -88,12 +91,14 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
     check_extra()
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
-    from plotly.offline import get_plotlyjs
 
-    every, summary = records(rows), summarise(rows)
+    every = records(rows)
+    summary = summarise(every)
     by_log = {log: of for (log,), of in groups(summary, "log").items()}
     done = _done(every)
-    drawn = draw_all(every, folder / "trajectories")
+    drawn = draw_all(every, folder / "trajectories", max(LEAST_POSES, POSES - POSES_OF_A_ROW * len(every)))
+    table, whys = runs.table(every)
+    common, blocks = runs.details(every)
     logs = [
         {
             "name": log,
@@ -122,7 +127,7 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
         description="" if plan is None else plan.description,
         again=None if again is None else quote(again),
         folder=quote(str(folder)),
-        example=next(((row["identity"] or "")[: sheets.SHOWN_OF_IDENTITY] for row in every if row["identity"]), None),
+        example=next(((row["identity"] or "")[: runs.SHOWN_OF_IDENTITY] for row in every if row["identity"]), None),
         written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         facts=runs.facts(every),
         failures=runs.failures(every),
@@ -135,19 +140,31 @@ def render(rows: pd.DataFrame, folder: Path, differences: Sequence[Record]) -> s
         late=_there(map(sheets.late_or_out, by_log.values())),
         costs=_there(map(sheets.cost, by_log.values())),
         logs=logs,
-        runs=sheets.every_run(every),
+        runs=every,
+        exact=runs.EXACT,
+        every_run=runs.heading(len(every), whys),
+        table_of_runs=table,
+        common=common,
+        details=blocks,
         environments=runs.environments(every),
         style=Markup((HERE / "page.css").read_text(encoding="utf-8")),
-        scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in ("tables.js", "figures.js")],
-        plotly=Markup(get_plotlyjs()),
+        scripts=[Markup((HERE / script).read_text(encoding="utf-8")) for script in SCRIPTS],
+        plotly=_packed_plotly(),
         embedded=embedded,
-        details=runs.details(every),
+        packed=packed,
         page={
             "looks": curves.looks(looks_of([label for (label,) in groups(every, "label")])),
             "axes": axes(),
             "logs": [{key: log[key] for key in ("name", "truth", "aligned", "anees", "costs")} for log in logs],
         },
     )  # fmt: skip
+
+
+@cache
+def _packed_plotly() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return packed_text(get_plotlyjs())
 
 
 def axes() -> dict[str, Any]:
@@ -170,27 +187,6 @@ def ordinal(k: int) -> str:
     """Return "2nd", "3rd", "4th", "11th", "22nd"."""
     suffix = "th" if k % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(k % 10, "th")
     return f"{k}{suffix}"
-
-
-def embedded(value: Any) -> Any:
-    """Return a value as JSON for a script element, which no text in it can end.
-
-    Non-finite numbers are null, and text is as `shown` gives it.
-    """
-    from markupsafe import Markup
-
-    text = json.dumps(_plain(value), separators=(",", ":"))
-    return Markup(text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e"))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {shown(str(key)): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, str):
-        return shown(value)
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _done(every: Sequence[Record]) -> sheets.Done:

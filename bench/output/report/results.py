@@ -41,7 +41,10 @@ def keep_plan(plan: Experiment, folder: Path) -> None:
     Raises:
         ExperimentError: it cannot be written.
     """
-    text = yaml.safe_dump(plain(plan), sort_keys=False, allow_unicode=True, width=120)
+    content = plain(plan)
+    if plan.seeds == tuple(range(1, len(plan.seeds) + 1)):
+        content["seeds"] = len(plan.seeds)
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120)
     with writing(folder / PLAN):
         (folder / PLAN).write_text(text, encoding="utf-8")
 

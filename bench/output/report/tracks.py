@@ -16,10 +16,8 @@ from ...results.summary import Record, groups
 from ..estimates import Track, error_m, has_bounds, is_near, tracks_of
 from .curves import named
 
-POSES = 200_000
-"""Poses that a page may hold, 48 bytes each: some 10 MB."""
 OF_A_TRACK = (2000, 1000, 500, 200)
-"""Poses drawn of one track: the most for which one seed of each log has room, else the least of these."""
+"""Poses drawn of one track: the most for which one seed of each log has room; else less than these."""
 MOST_SEEDS = 10
 """Seeds of a log that are drawn at most: more take long to read, and are too many to look through."""
 
@@ -43,17 +41,19 @@ class Drawn:
     missing: list[str] = field(default_factory=list)
 
 
-def draw_all(rows: Sequence[Record], folder: Path) -> dict[str, Drawn]:
+def draw_all(rows: Sequence[Record], folder: Path, room: int) -> dict[str, Drawn]:
     """Read as many seeds of each log as the page has room for; seeds with a run that did not finish come first.
 
     Args:
         rows: of the store.
         folder: where its trajectories are.
+        room: how many poses the page has room for.
     """
     logs = {log: groups(of, "seed") for (log,), of in groups(filter(_is_saved, rows), "log").items()}
     lengths = [_poses(folder / row["trajectory"]) for of_log in logs.values() for row in next(iter(of_log.values()))]
-    most = next((m for m in OF_A_TRACK if sum(min(m, n) for n in lengths) <= POSES), OF_A_TRACK[-1])
-    seeds = min(MOST_SEEDS, max(1, POSES // max(1, sum(min(most, n) for n in lengths))))
+    fewest = max(2, room // max(1, len(lengths)))
+    most = next((m for m in OF_A_TRACK if sum(min(m, n) for n in lengths) <= room), min(OF_A_TRACK[-1], fewest))
+    seeds = min(MOST_SEEDS, max(1, room // max(1, sum(min(most, n) for n in lengths))))
     return {
         log: _draw({seed: of for (seed,), of in of_log.items()}, folder, most, seeds) for log, of_log in logs.items()
     }

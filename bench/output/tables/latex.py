@@ -12,12 +12,10 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import pandas as pd
-
 from ...metrics.bootstrap import FEWEST_SEEDS
 from ...results.intervals import TABLED, summarise_with_intervals
 from ...results.step_time import machine_name
-from ...results.summary import UNFINISHED, Record, file_names, groups, records
+from ...results.summary import UNFINISHED, Record, Rows, file_names, groups, records
 from .. import notices
 from ..cells import ACCURACY, NEES_NOTE, Column, digits, lag, scored_how, spans
 from ..sheets import NOT_COMPARABLE, accuracy
@@ -30,14 +28,15 @@ LONG = 24
 COSTS = ("step_median_us", "step_p99_us", "real_time_factor")
 
 
-def write_latex(rows: pd.DataFrame, path: Path) -> None:
+def write_latex(rows: Rows, path: Path) -> None:
     r"""Write what `summarise_with_intervals` returns as LaTeX: a `table*` per log, to be \input by a paper."""
     path.write_text(latex(rows), encoding="ascii")
 
 
-def latex(rows: pd.DataFrame) -> str:
+def latex(rows: Rows) -> str:
     """Return a `table*` per log whose recording was there, see `write_latex`."""
-    every = [row for row in records(rows) if row["status"] != "absent"]
+    rows = records(rows)
+    every = [row for row in rows if row["status"] != "absent"]
     summary = groups(summarise_with_intervals(rows), "log")
     labels = file_names(f"{row['experiment']}-{row['log']}" for row in every)
     tables = []
@@ -184,4 +183,4 @@ def _has_intervals(summary: Sequence[Record]) -> bool:
 
 def _is_examined(rows: Sequence[Record]) -> bool:
     """Whether NIS was asked for: each epoch was then handed over in two steps, which changes the costs."""
-    return any(json.loads(row["spec"] or "{}").get("scores", {}).get("nis", False) for row in rows)
+    return any(json.loads(spec or "{}").get("scores", {}).get("nis", False) for spec in {row["spec"] for row in rows})

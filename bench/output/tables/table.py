@@ -18,7 +18,7 @@ from ...files import write_csv
 from ...metrics.scoring import by_reason
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
-from ...results.summary import CONSISTENCY, Record, groups, is_judged, records, summarise
+from ...results.summary import CONSISTENCY, Record, Rows, groups, is_judged, records, summarise
 from ...results.summary import consistency as consistency_of
 from .. import notices, sheets
 from ..cells import Cell
@@ -31,13 +31,13 @@ ANY_WIDTH = 10_000
 """More letters than any table is wide; in less room rich gives the width after cutting."""
 
 
-def write_table(rows: pd.DataFrame, path: Path) -> None:
+def write_table(rows: Rows, path: Path) -> None:
     """Write what `summarise_with_intervals` returns as CSV; an absent number is an empty field, and `missing` why."""
     summary = [row | {"missing": json.dumps(by_reason(row["missing"]))} for row in summarise_with_intervals(rows)]
     write_csv(pd.DataFrame(summary), path)
 
 
-def write_consistency(rows: pd.DataFrame, path: Path) -> None:
+def write_consistency(rows: Rows, path: Path) -> None:
     """Write what `consistency` returns as CSV."""
     write_csv(pd.DataFrame(consistency_of(rows), columns=list(CONSISTENCY)), path)
 
@@ -47,21 +47,23 @@ def write_paired(differences: Sequence[Record], path: Path) -> None:
     write_csv(pd.DataFrame(differences, columns=list(PAIRED)), path)
 
 
-def print_table(rows: pd.DataFrame, console: Console | None = None, differences: Sequence[Record] = ()) -> None:
+def print_table(rows: Rows, console: Console | None = None, differences: Sequence[Record] = ()) -> None:
     """Print the tables of each log, the `differences` that `paired` found, and the remarks."""
-    console = console or terminal.console()
+    console, rows = console or terminal.console(), records(rows)
     print_logs(rows, console)
     print_differences(differences, console)
     print_remarks(rows, console)
 
 
-def print_logs(rows: pd.DataFrame, console: Console) -> None:
+def print_logs(rows: Rows, console: Console) -> None:
     """Print the tables of each log, but of none whose recording is not here.
 
     Accuracy and cost for every log; the floor where it was asked for; consistency where NIS was asked for, or seeds are
     enough for ANEES; late readings and outliers where there were any.
     """
-    for summary in groups(summarise(rows.loc[rows["status"] != "absent"]), "log").values():
+    every = records(rows)
+    here = [row for row in every if row["status"] != "absent"]
+    for summary in groups(summarise(every if len(here) == len(every) else here), "log").values():
         found = [sheets.accuracy(summary), sheets.over_floor(summary)]
         found += [sheets.consistency(summary) if is_judged(summary) else None, sheets.late_or_out(summary)]
         for sheet in found:
@@ -76,10 +78,10 @@ def print_differences(differences: Sequence[Record], console: Console) -> None:
         print_sheet(sheet, console, noted=sheet is found[-1])
 
 
-def print_remarks(rows: pd.DataFrame, console: Console) -> None:
+def print_remarks(rows: Rows, console: Console) -> None:
     """Print a line for each run that did not finish, for results not to be trusted, and for what the runs noticed."""
     every = records(rows)
-    for line in failures(every) + mostly_outside(every) + not_positive(summarise(rows)):
+    for line in failures(every) + mostly_outside(every) + not_positive(summarise(every)):
         console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
     for line, routine in notices.lines(every):
         told = fill(line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False)

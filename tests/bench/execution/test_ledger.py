@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from fathom.bench.errors import ExperimentError
+from fathom.bench.errors import ExperimentError, StoppedError
 from fathom.bench.execution import sweep as runner
 from fathom.bench.execution import worker as working
 from fathom.bench.execution.sweep import run_experiment, sweep
+from fathom.bench.execution.task import Finished
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.output.tables.table import write_table
 from fathom.bench.results import identity as ledger
@@ -118,7 +119,8 @@ def test_trajectories_that_no_row_speaks_of_are_swept(tmp_path: Path, ran: list[
     folder = tmp_path / "t" / "trajectories"
     spoken_of = {path.name for path in folder.iterdir()}
     assert len(spoken_of) == 2
-    (folder / "half.parquet.123").write_bytes(b"x")
+    (truth,) = (name for name in spoken_of if "truth" in name)
+    (folder / f"{truth}.123").write_bytes(b"x")  # of a process that was killed
     changed = [{"name": "dead-reckoning", "with": {"attitude": "gyro"}}]
     rows = run_experiment(experiment(estimators=changed), out=tmp_path)
     left = {path.name for path in folder.iterdir()}
@@ -318,3 +320,120 @@ def runner_costs() -> list[str]:
     from fathom.bench.metrics.scoring import COSTS
 
     return list(COSTS)
+
+
+# -- files that are not the store's -----------------------------------------------------------------------------------
+
+
+def test_nothing_is_removed_that_this_store_did_not_write(tmp_path: Path, ran: list[str]) -> None:
+    mine, elsewhere = tmp_path / "t" / "trajectories", tmp_path / "elsewhere"
+    for folder in (mine, elsewhere):
+        folder.mkdir(parents=True)
+    others = [mine / "dive.parquet", mine / "dive.parquet.7", mine / "notes.txt", elsewhere / "thesis.parquet"]
+    for path in others:
+        path.write_bytes(b"years of work")
+    (mine / "link.parquet").symlink_to(elsewhere / "thesis.parquet")
+    (mine / "gone.parquet").symlink_to(tmp_path / "unmounted" / "dive.parquet")
+    (tmp_path / "t" / "lock").write_text("not a number of a process\n")
+    for force in (False, True):
+        changed = [{"name": "dead-reckoning", "with": {"attitude": "gyro" if force else "heading"}}]
+        run_experiment(experiment(estimators=changed), out=tmp_path, force=force)
+    assert all(path.read_bytes() == b"years of work" for path in others)
+    assert (mine / "link.parquet").is_symlink()
+    assert (mine / "gone.parquet").is_symlink()
+    assert (tmp_path / "t" / "lock").read_text() == "not a number of a process\n"
+    assert len(list(mine.glob("lawnmower*"))) == 2
+
+
+def test_a_folder_of_trajectories_that_is_a_link_is_swept_behind_it_of_our_own_files_alone(
+    tmp_path: Path, ran: list[str]
+) -> None:
+    big = tmp_path / "big disk"
+    big.mkdir()
+    (big / "other.parquet").write_bytes(b"x")
+    (tmp_path / "t").mkdir()
+    (tmp_path / "t" / "trajectories").symlink_to(big)
+    for attitude in ("gyro", "heading"):
+        run_experiment(
+            experiment(estimators=[{"name": "dead-reckoning", "with": {"attitude": attitude}}]), out=tmp_path
+        )
+    assert len(list(big.glob("lawnmower*"))) == 2
+    assert (big / "other.parquet").exists()
+
+
+@pytest.mark.parametrize("name", ["table.csv", "report.html", "figures/mine.pdf"])
+def test_what_lies_in_the_folder_without_a_store_is_not_written_over(tmp_path: Path, ran: list[str], name: str) -> None:
+    (tmp_path / "t" / name).parent.mkdir(parents=True)
+    (tmp_path / "t" / name).write_text("mine")
+    with pytest.raises(ExperimentError, match=rf"{name}: is there, but no runs.sqlite .* another --out"):
+        run_experiment(experiment(), out=tmp_path, force=True)
+    assert (tmp_path / "t" / name).read_text() == "mine"
+    assert ran == []
+
+
+def test_the_folder_may_have_spaces_and_letters_of_any_script_and_a_long_label(tmp_path: Path, ran: list[str]) -> None:
+    label = "wörter mit Lücken, " * 20
+    plan = experiment(estimators=[{"name": "dead-reckoning", "label": label}], logs=[SHORT | {"name": "海 " * 90}])
+    out = tmp_path / "Ergebnisse für 海, 50 %"
+    for _ in range(2):
+        rows = run_experiment(plan, out=out)
+    assert rows["status"].tolist() == ["done"]
+    assert (out / "t" / "trajectories" / rows["trajectory"][0]).is_file()
+    assert len(ran) == 1
+
+
+# -- one bad run is one bad row ---------------------------------------------------------------------------------------
+
+
+def test_a_message_that_is_no_text_is_one_bad_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = working.WorkerCache()
+
+    def here(tasks: Any, jobs: int) -> Any:
+        for task in tasks:
+            if task.run.seed == 1:
+                yield Finished([task.row("failed", "bad file name \udcff\x00") | {"peak_mb": np.float32(1.5)}])
+            else:
+                yield bench.execute(task)
+
+    monkeypatch.setattr(runner, "run_all", here)
+    rows = run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    assert rows["status"].tolist() == ["failed", "done"]
+    assert rows["cause"][0] == "bad file name \\udcff\x00"
+    assert rows["peak_mb"][0] == 1.5
+
+
+def test_a_row_that_cannot_be_read_is_made_again(tmp_path: Path, ran: list[str]) -> None:
+    run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
+    with closing(sqlite3.connect(tmp_path / "t" / "runs.sqlite")) as store, store:
+        store.execute("UPDATE runs SET counts = '{\"readings\": ' WHERE seed = 1")
+    assert load_runs(tmp_path / "t")["status"].tolist() == ["failed", "done"]
+    assert run_experiment(experiment(seeds=[1, 2]), out=tmp_path)["status"].tolist() == ["done", "done"]
+    assert ran[2:] == ["lawnmower-tactical / dead-reckoning seed 1"]
+
+
+def test_the_rows_of_a_call_hold_the_whole_spec(tmp_path: Path, ran: list[str]) -> None:
+    plan = experiment(seeds=[1, 2])
+    for _ in range(2):
+        rows = run_experiment(plan, out=tmp_path)
+        assert [json.loads(spec) for spec in rows["spec"]] == [plan.spec(run) for run in plan.runs()]
+
+
+# -- a full disk ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("where", "call"), [(os, "fsync"), (Path, "replace")])
+def test_a_disk_that_fills_up_keeps_what_was_finished_and_says_so(
+    tmp_path: Path, ran: list[str], monkeypatch: pytest.MonkeyPatch, where: Any, call: str
+) -> None:
+    run_experiment(experiment(seeds=[1]), out=tmp_path)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(where, call, full)
+        with pytest.raises(StoppedError, match=r"No space left on device.*the runs before are kept"):
+            run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path)
+    assert load_runs(tmp_path / "t")["seed"].tolist() == [1]
+    assert not list((tmp_path / "t" / "trajectories").glob("*.parquet.*"))
+    assert len(run_experiment(experiment(seeds=[1, 2, 3]), out=tmp_path)) == 3

@@ -404,6 +404,56 @@ def test_hundreds_of_runs_stay_usable(rows: pd.DataFrame, folder: Path, browser:
         assert re.fullmatch(r"\[[\d.,]+, [\d.,]+\]", interval)
 
 
+def test_of_thousands_of_runs_those_that_are_scrolled_to_are_made_and_all_are_sorted_searched_and_opened(
+    rows: pd.DataFrame, folder: Path, browser: Any, tmp_path: Path
+) -> None:
+    two = rows[(rows["label"] == "rts") & (rows["seed"] == 1)]
+    every = two.loc[two.index.repeat(1500)].reset_index(drop=True)
+    seeds = np.tile(np.arange(1500), 2)
+    shuffled = np.random.default_rng(1).permutation(1500)[seeds]
+    every = every.assign(
+        seed=pd.array(seeds, "Int64"),
+        identity=[f"{seed:08x}" for seed in seeds],
+        ate_rmse_m=1.0 + shuffled / 7,
+        trajectory=None,
+    )
+    file = page_of(every, folder, tmp_path)
+    assert file.stat().st_size < 3e6
+    with opened(browser, file) as page:
+        made = page.locator("tr[data-run]")
+        made.nth(999).wait_for(state="attached")
+        assert made.count() == 1000
+        for last in (1999, 2999):
+            page.locator("#more").scroll_into_view_if_needed()
+            made.nth(last).wait_for(state="attached")
+        assert not page.locator("#more").is_visible()
+        header = page.locator("table.runs thead button").nth(3)
+        header.click()
+        header.click()
+        first = column(page, -1, 3)[0]
+        assert len(first) == 1000
+        assert [float(value or 0) for value in first] == pytest.approx((1.0 + np.arange(1499, 499, -1) / 7), rel=1e-5)
+        page.locator("#filter").fill("000005db online")  # far below what is made
+        assert page.locator("#filtered").inner_text() == "1 of 3000"
+        page.locator("tr[data-run] .opens").click()
+        assert json.loads(page.locator(".detail pre").inner_text())["seed"] == 1499
+        page.locator("#filter").fill("no such run")
+        assert made.count() == 0
+        page.locator("#filter").fill("")
+        assert made.count() == 1000
+
+
+def test_causes_beyond_what_one_reads_are_left_to_the_table_of_runs(rows: pd.DataFrame, folder: Path) -> None:
+    one = rows.iloc[[0]]
+    every = one.loc[one.index.repeat(300)].reset_index(drop=True)
+    every = every.assign(
+        seed=pd.array(range(300), "Int64"), status="failed", cause=[f"unlike the others: {k}" for k in range(300)]
+    )
+    text = render(every.assign(trajectory=None), folder, ())
+    assert text.count("unlike the others") == 200
+    assert "and 100 more; the table of runs has them all" in text
+
+
 def test_what_a_store_lacks_is_reported_and_the_rest_is_shown(
     rows: pd.DataFrame, folder: Path, browser: Any, tmp_path: Path
 ) -> None:

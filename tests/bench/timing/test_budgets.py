@@ -16,8 +16,6 @@ NEAR = {
     "our Python factor over a native one, 3 × 12",  # 8 of 10
     "harness over eskf's steps, 10 min",  # by the clock, and 0.4 of 0.5
     "two workers over one, 100 runs",  # needs two idle cores
-    "20,000 finished runs, the same command again",  # missed
-    "20,000 finished runs, peak memory of it",  # missed
 }
 
 
