@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from .errors import DatasetError
+from .read_only import make_read_only
 from .rig import Rig
 from .state import Array, Belief, TimeArray
 from .trajectory import Trajectory
@@ -161,7 +162,7 @@ class AttitudeStream(ReadingStream):
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One voyage.
+    """One voyage. Its arrays are read-only, those of the rig, the truth and the prior too: runs share a log.
 
     Attributes:
         name: its name in tables.
@@ -187,6 +188,9 @@ class Log:
     prior: Belief | None = None
     notes: tuple[str, ...] = ()
     origin: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        make_read_only(self)
 
     @property
     def streams(self) -> dict[str, ReadingStream]:

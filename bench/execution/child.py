@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import os
 import runpy
+import signal
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import Pipe
@@ -35,8 +37,9 @@ class Child:
     process: Popen[bytes]
 
     def kill(self) -> None:
-        """Kill the process at once."""
-        self.process.kill()
+        """Kill the process at once, and those that it has started."""
+        with suppress(ProcessLookupError, PermissionError):  # nobody is left
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self.connection.close()
         if self.process.stdin is not None:

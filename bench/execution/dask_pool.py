@@ -212,8 +212,18 @@ class _Cluster:
         if isinstance(answer, Greeting):
             self._meet(worker, answer)
         else:
-            worker.task = None
+            yield from self._accept(worker, answer)
+
+    def _accept(self, worker: _RemoteWorker, answer: object) -> Iterator[Finished]:
+        """Take the result of a worker's task; what is no result of it fails the task."""
+        task, worker.task = worker.task, None
+        if task is None:
+            return
+        if isinstance(answer, Finished) and task.answered_by(answer):
             yield answer
+        else:
+            cause = f"worker {worker.address} gave {type(answer).__name__}, which is no result of this run"
+            yield Finished([task.row("failed", cause) | _provenance(worker)])
 
     def _meet(self, worker: _RemoteWorker, answer: Greeting) -> None:
         """Accept a worker whose versions are those of this process; its rows would otherwise name the wrong ones."""

@@ -38,6 +38,7 @@ class Result:
             and after a comma what is unusual in that.
         notes: how the start was found, in sentences.
         nis: INNOVATION rows, in the order of reception; None where they were not asked for.
+        traceback: of the error that ended it; None for any other ending.
     """
 
     status: Status
@@ -54,6 +55,7 @@ class Result:
     start: str = "given"
     notes: tuple[str, ...] = ()
     nis: NDArray[Any] | None = None
+    traceback: str | None = None
 
     @property
     def outputs(self) -> dict[str, Trajectory]:

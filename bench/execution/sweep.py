@@ -95,7 +95,7 @@ def sweep(
         finished_log: called with the rows of a log as soon as the last of its runs has ended.
 
     Raises:
-        ExperimentError, EstimatorError, DatasetError: nothing was run.
+        ExperimentError, EstimatorError, DatasetError: nothing was run; or, at the end, a planned run has no result.
     """
     if not isinstance(experiment, Experiment):
         experiment = Experiment.load(experiment)
@@ -127,7 +127,25 @@ def sweep(
                         progress.clear()
                         finished_log(rows_of(store.read(log), runs))
         _sweep(folder / "trajectories", store.trajectories())
-        return Outcome(rows_of(store.read(), runs), len(tasks) - len(missing), renewed, kept)
+        rows = rows_of(store.read(), runs)
+        _refuse_silence(runs, rows)
+        return Outcome(rows, len(tasks) - len(missing), renewed, kept)
+
+
+def _refuse_silence(runs: Sequence[Run], rows: pd.DataFrame) -> None:
+    """Refuse to end as if all were well where a planned run has no row.
+
+    Raises:
+        ExperimentError: names the first such run.
+    """
+    seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
+    told = set(zip(rows["log"], rows["label"], seeds, strict=True))
+    silent = [run for run in runs if (run.log.name, run.estimator.label, run.seed) not in told]
+    if silent:
+        raise ExperimentError(
+            f"{len(silent)} of {len(runs)} planned runs have no result, the first is {silent[0]}; finished runs are "
+            "kept, and the same command continues"
+        )
 
 
 def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[Task]]:
