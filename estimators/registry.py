@@ -68,7 +68,7 @@ def load_estimator(name: str) -> Any:
     known = known_estimators()
     if name not in known:
         raise EstimatorError(f"no estimator {name!r}{nearest(name, known)} (known: {', '.join(known)})")
-    makers = ["fathom"] * (name in ESTIMATORS) + [_package(point) for point in entry_points(group=GROUP, name=name)]
+    makers = ["fathom"] * (name in ESTIMATORS) + sorted(map(_package, entry_points(group=GROUP, name=name)))
     if len(makers) > 1:
         raise EstimatorError(
             f"{name}: several packages bring an estimator of this name ({', '.join(makers)}); rename or uninstall one"
