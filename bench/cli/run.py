@@ -29,8 +29,15 @@ def run(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help='Run on a Dask cluster: tcp://host:port, its scheduler file (.json), or "local" (starts a cluster of '
-            "--jobs processes here).",
+            help='Run on a Dask cluster: tcp://host:port, tls://host:port, its scheduler file (.json), or "local" '
+            "(starts a cluster of --jobs processes here).",
+        ),
+    ] = None,
+    tls: Annotated[
+        tuple[Path, Path, Path] | None,
+        typer.Option(
+            metavar="CA CERT KEY",
+            help="For tls://: PEM files of the authority's certificate, of this process's, and of its private key.",
         ),
     ] = None,
 ) -> None:
@@ -39,6 +46,7 @@ def run(
     Every estimator of EXPERIMENT runs on each of its logs. Finished runs are kept. They are repeated only if their
     spec, their log or a version has changed.
     """
+    from ..execution.dask_pool import Tls
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
     from ..output.present import present, print_log
@@ -52,7 +60,7 @@ def run(
         printed.update(rows["log"])
 
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
-        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, print_finished)
+        outcome = sweep(plan, data, out, jobs, only, repair, force, dask, print_finished, Tls(*tls) if tls else None)
     present(outcome, plan, folder, printed)
     statuses = set(outcome.rows.loc[~outcome.rows["log"].isin(outcome.kept), "status"])
     if statuses <= {"absent"}:  # nothing was run

@@ -24,7 +24,7 @@ from ..files import writing
 from ..results.identity import content_sha256
 from ..results.store import Row, Store, provenance, sole_writer
 from .cold_start import compile_first
-from .dask_pool import run_on_cluster
+from .dask_pool import Tls, run_on_cluster
 from .pool import run_all
 from .task import Task
 
@@ -61,9 +61,10 @@ def run_experiment(
     repair: bool = False,
     force: bool = False,
     dask: str | None = None,
+    tls: Tls | None = None,
 ) -> pd.DataFrame:
     """Run every estimator on every log and return the rows of the store, one per run and output; see `sweep`."""
-    return sweep(experiment, data, out, jobs, only, repair, force, dask).rows
+    return sweep(experiment, data, out, jobs, only, repair, force, dask, tls=tls).rows
 
 
 def sweep(
@@ -76,6 +77,7 @@ def sweep(
     force: bool = False,
     dask: str | None = None,
     finished_log: Callable[[pd.DataFrame], None] | None = None,
+    tls: Tls | None = None,
 ) -> Outcome:
     """Run what the store lacks, and return its rows.
 
@@ -93,6 +95,7 @@ def sweep(
         force: repeat runs that are in the store already.
         dask: address of a Dask scheduler, its scheduler file, or "local", see `dask_pool`; else worker processes here.
         finished_log: called with the rows of a log as soon as the last of its runs has ended.
+        tls: certificates for a scheduler at a tls:// address, see `dask_pool`.
 
     Raises:
         ExperimentError, EstimatorError, DatasetError: nothing was run; or, at the end, a planned run has no result.
@@ -115,7 +118,7 @@ def sweep(
         for batch in _batches(missing, duration_s):
             if dask in (None, "local"):
                 compile_first(task.run.estimator.create() for task in batch)
-            ended = run_all(batch, jobs) if dask is None else run_on_cluster(batch, dask, jobs, progress.say)
+            ended = run_all(batch, jobs) if dask is None else run_on_cluster(batch, dask, jobs, progress.say, tls)
             with progress, closing(ended):
                 for each in ended:
                     rows = each.keep(folder)
