@@ -47,7 +47,7 @@ def check_form(belief: Belief, t_ns: int) -> None:
         ("b_g", (3,), x.b_g),
         ("P", (DIM, DIM), belief.P),
     ):
-        if not (isinstance(values, np.ndarray) and values.dtype is FLOAT and values.shape == shape):
+        if type(values) is not np.ndarray or values.dtype is not FLOAT or values.shape != shape:
             _check_array(name, values, shape)
 
 
@@ -118,8 +118,10 @@ def _not_rotations(R: Array) -> Iterator[WrongValue]:
 def _not_covariances(P: Array | None) -> Iterator[WrongValue]:
     if P is None:
         return
-    rows = np.flatnonzero(~np.isnan(P).all(axis=(1, 2)))
-    P = P[rows]
+    absent = np.isnan(P[:, 0, 0])
+    absent[absent] = np.isnan(P[absent]).all(axis=(1, 2))
+    rows = np.flatnonzero(~absent)
+    P = P[rows] if absent.any() else P
     if _is_positive_definite(P):
         return
     variance = np.abs(P.diagonal(axis1=1, axis2=2)).reshape(len(P), -1, 3).mean(axis=2)
@@ -135,11 +137,10 @@ def _not_covariances(P: Array | None) -> Iterator[WrongValue]:
 
 
 def _is_positive_definite(P: Array) -> bool:
-    """Return whether all covariances are, at a sixth of what eigenvalues cost; as a rule that is so."""
+    """Return whether all covariances are, far from doubt, at a sixth of what eigenvalues cost; as a rule that is so."""
     try:
         np.linalg.cholesky(P)
     except np.linalg.LinAlgError:
         return False
-    sigma = np.sqrt(P.diagonal(axis1=1, axis2=2))
-    allowed = COVARIANCE_TOLERANCE * (sigma[:, :, None] * sigma[:, None, :])
-    return bool((np.abs(P - P.swapaxes(1, 2)) <= allowed).all())  # NaN is not
+    least = P.diagonal(axis1=1, axis2=2).min(initial=np.inf)
+    return bool(np.abs(P - P.swapaxes(1, 2)).max(initial=0.0) <= COVARIANCE_TOLERANCE * least)  # NaN is not
