@@ -2,7 +2,8 @@
 
 - this folder: the types, and nothing else. `log` (streams and a log), `rig` (mountings, noise), `state` (state, error
   order, belief), `trajectory`, `epochs` (a log cut in the order of reception), `quantities`, `times`, `errors`.
-- `formats`: one loader per file format; knows files, and no vehicle.
+- `compiling`: how functions are compiled, and where compiled code is kept.
+- `formats`: one loader per file format, and all YAML; knows files, and no vehicle.
 - `described`: log.yaml, and from it and the files to a `Log`; also writes a log as a described folder.
 - `simulated`: missions, sensors and faults; `simulate(Scenario(...), seed)`.
 - `catalog`: descriptions of known recordings, without the recordings.

@@ -54,12 +54,12 @@ def nearest_file(path: Path, *, folders: bool = False) -> str:
     return nearest(path.name, [other.name for other in beside if folders or other.is_file()])
 
 
-def one_line(error: Exception) -> str:
+def one_line(error: BaseException) -> str:
     """Return the class and the message of an error, on one line, as `shown` does."""
     return shown(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
-def not_loaded(point: EntryPoint, error: Exception) -> str:
+def not_loaded(point: EntryPoint, error: BaseException) -> str:
     """Return that an entry point of an installed package cannot be loaded, and why."""
     package = point.dist.name if point.dist else point.value
     return f"cannot be loaded from the package {package!r}: {one_line(error)}"

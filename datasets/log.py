@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .errors import DatasetError
 from .imu_time import gaps_ns, sampling_ns
+from .read_only import make_read_only
 from .rig import Rig
 from .rotations import UNHEARD, complaint, off_rotation
 from .state import Array, Belief, TimeArray
@@ -183,7 +184,7 @@ class AttitudeStream(ReadingStream):
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One voyage.
+    """One voyage. Its arrays are read-only, those of the rig, the truth and the prior too: runs share a log.
 
     Attributes:
         name: its name in tables.
@@ -212,6 +213,9 @@ class Log:
     notes: tuple[str, ...] = ()
     origin: tuple[float, float] | None = None
     max_wait_s: float | None = None
+
+    def __post_init__(self) -> None:
+        make_read_only(self)
 
     @property
     def streams(self) -> dict[str, ReadingStream]:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.compiled import Records, compiled, inner
+from ..datasets.compiling.decorators import Records, compiled, inner
 from ..datasets.epochs import DVL, READING, SENSOR
 from ..datasets.state import TimeArray
 from .interface import unknown_kind

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..datasets.compiled import compiled
+from ..datasets.compiling.decorators import compiled
 from .interface import FACTORS, sensors_among
 
 Loss = Literal["huber", "cauchy", "tukey"]

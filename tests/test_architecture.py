@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LEVEL = {"datasets": 0, "estimators": 1, "bench": 2}
-TYPES_OF_A_LOG = {"compiled", "compiled_cache", "epochs", "errors", "log", "quantities", "rig", "rotations", "state"}
+TYPES_OF_A_LOG = {"compiling", "epochs", "errors", "log", "quantities", "rig", "rotations", "state"}
 TYPES_OF_A_LOG |= {"imu_time", "notes", "trajectory"}
 HEAVY = {"matplotlib", "pandas", "gtsam", "numba", "numpy", "scipy", "pyarrow"}
 SOURCES = [path for folder in LEVEL for path in sorted((ROOT / folder).rglob("*.py"))]

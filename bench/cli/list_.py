@@ -54,7 +54,7 @@ def _logs() -> dict[str, str]:
 
 
 def _experiments() -> dict[str, str]:
-    from ...datasets.yaml_file import read_yaml
+    from ...datasets.formats.yaml_file import read_yaml
     from ..experiment.packaged import shipped_experiments
 
     return {name: read_yaml(path)["description"] for name, path in shipped_experiments().items()}

@@ -35,8 +35,15 @@ def run(
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help='Run on a Dask cluster: tcp://host:port, its scheduler file (.json), or "local" (starts a cluster of '
-            "--jobs processes here).",
+            help='Run on a Dask cluster: tcp://host:port, tls://host:port, its scheduler file (.json), or "local" '
+            "(starts a cluster of --jobs processes here).",
+        ),
+    ] = None,
+    tls: Annotated[
+        tuple[Path, Path, Path] | None,
+        typer.Option(
+            metavar="CA CERT KEY",
+            help="For tls://: PEM files of the authority's certificate, of this process's, and of its private key.",
         ),
     ] = None,
 ) -> None:
@@ -47,6 +54,7 @@ def run(
     clocks, coordinates. What is found is printed and kept with the runs.
     """
     from ..errors import ExperimentError, StoppedError
+    from ..execution.dask_pool import Tls
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
     from ..output.present import present, print_log
@@ -60,8 +68,9 @@ def run(
         printed.update(rows["log"])
 
     with on_interrupt(f"interrupted: finished runs are kept in {folder / 'runs.sqlite'}; the same command continues"):
+        certificates = Tls(*tls) if tls else None
         outcome = sweep(
-            plan, data, out, jobs, only, repair, force, dask, print_finished, check=not no_check, strict=strict
+            plan, data, out, jobs, only, repair, force, dask, print_finished, not no_check, strict, certificates
         )
     try:
         present(outcome, plan, folder, printed)

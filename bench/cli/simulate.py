@@ -34,8 +34,8 @@ def simulate(
 
 
 def _scenario(text: str) -> Scenario:
+    from ...datasets.formats.yaml_file import read_yaml
     from ...datasets.simulated.scenario import Scenario
-    from ...datasets.yaml_file import read_yaml
 
     if not text.endswith((".yaml", ".yml")):
         return Scenario.from_dict({"mission": text})

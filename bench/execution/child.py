@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import Pipe
@@ -39,8 +39,9 @@ class Child:
     process: Popen[bytes]
 
     def kill(self) -> None:
-        """Kill the process at once."""
-        self.process.kill()
+        """Kill the process at once, and those that it has started."""
+        with suppress(ProcessLookupError, PermissionError):  # nobody is left
+            os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait()
         self.connection.close()
         if self.process.stdin is not None:

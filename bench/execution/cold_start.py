@@ -21,7 +21,7 @@ from typing import Any, cast
 from rich.console import Console
 
 from ... import estimators
-from ...datasets.compiled_cache import compiled_folder
+from ...datasets.compiling.cache import compiled_folder
 from ...estimators.interface import Estimator
 from ..experiment.plan import plain
 from .child import Child, start

@@ -27,6 +27,7 @@ from .task import Finished, Task
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+    from distributed.security import Security
 
 TRIES = 3
 """After so many lost workers a run is recorded as failed: it is then more likely the cause than bad luck is."""
@@ -44,15 +45,33 @@ FETCH_S = 60.0
 """How long a finished worker may take to send its rows and trajectories, s; some megabytes."""
 
 
-def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable[[str], None]) -> Generator[Finished]:
+@dataclass(frozen=True)
+class Tls:
+    """The PEM files by which a scheduler and this process know each other.
+
+    Attributes:
+        ca: certificates of the authorities that sign.
+        cert, key: certificate of this process, and its private key.
+    """
+
+    ca: Path
+    cert: Path
+    key: Path
+
+
+def run_on_cluster(
+    tasks: Sequence[Task], address: str, jobs: int, say: Callable[[str], None], tls: Tls | None = None
+) -> Generator[Finished]:
     """Yield the result of each task as it ends, from the workers of a Dask cluster.
 
     Args:
         tasks: the runs.
-        address: of a scheduler ("tcp://host:8786"), or its scheduler file (.json); or "local", which makes a cluster of
-            processes here for as long as this lasts.
+        address: of a scheduler ("tcp://host:8786", "tls://host:8786"), or its scheduler file (.json); or "local", which
+            makes a cluster of processes here for as long as this lasts. By a certificate that only these processes
+            have, it lets no other user of the machine in.
         jobs: worker processes of a local cluster; 0 for one per core.
         say: called with messages for the user.
+        tls: for a "tls://" address; by default what Dask's own configuration says.
 
     Raises:
         ExperimentError: the extra is missing; the scheduler cannot be reached, or is lost; a worker has other
@@ -60,21 +79,31 @@ def run_on_cluster(tasks: Sequence[Task], address: str, jobs: int, say: Callable
     """
     if not tasks:
         return
-    with _connected(address, min(jobs or os.cpu_count() or 1, len(tasks)) if address == "local" else jobs) as client:
+    jobs = min(jobs or os.cpu_count() or 1, len(tasks)) if address == "local" else jobs
+    with _connected(address, jobs, tls) as client:
         yield from _Cluster(client, tasks, say).run()
 
 
 @contextmanager
-def _connected(address: str, jobs: int) -> Iterator[Client]:
+def _connected(address: str, jobs: int, tls: Tls | None = None) -> Iterator[Client]:
     try:
         from distributed import Client, LocalCluster
+        from distributed.security import Security
+
+        own = Security.temporary() if address == "local" else None
     except ImportError as error:
         raise ExperimentError(f"{error}; --dask needs an extra: pip install 'fathom-bench[dask]'") from None
     if address == "local":
         from dask.config import set as configured
 
         with (
-            configured({"distributed.scheduler.worker-ttl": None}),
+            configured(
+                {
+                    "distributed.scheduler.worker-ttl": None,
+                    "distributed.scheduler.http.routes": [],  # nothing is served to who has no certificate
+                    "distributed.worker.http.routes": [],
+                }
+            ),
             LocalCluster(
                 n_workers=jobs,
                 threads_per_worker=1,
@@ -82,23 +111,49 @@ def _connected(address: str, jobs: int) -> Iterator[Client]:
                 dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=CRITICAL,
+                security=own,
                 preload=[f"{__package__}.dask_worker"],
             ) as cluster,
-            Client(cluster, set_as_default=False) as client,
+            Client(cluster, security=own, set_as_default=False) as client,
         ):
             yield client
         return
     if jobs:
         raise ExperimentError(f"--jobs {jobs}: only for --dask local; the cluster at {address} has its own workers")
+    scheduler = _scheduler(address)
+    security = _security(address, scheduler, tls)
     try:
-        client = Client(_scheduler(address), timeout=CONNECT_S, set_as_default=False)
+        client = Client(scheduler, timeout=CONNECT_S, security=security, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise ExperimentError(
             f"--dask {address}: no Dask scheduler answers within {CONNECT_S:.0f} s ({error}); expected local, "
-            "tcp://host:port, or a scheduler file (.json)"
+            "tcp://host:port, tls://host:port, or a scheduler file (.json)"
         ) from None
     with client:
         yield client
+
+
+def _security(address: str, scheduler: str, tls: Tls | None) -> Security | None:
+    """Return what Dask wants of the files of a tls:// scheduler, or what its own configuration says; else None.
+
+    Raises:
+        ExperimentError: no certificates for tls://, some that cannot be read, or some for another kind of address.
+    """
+    from distributed.security import Security
+
+    if not scheduler.startswith("tls://"):
+        if tls is not None:
+            raise ExperimentError(f"--dask {address}: --tls is for an address tls://host:port")
+        return None
+    files = {} if tls is None else {"tls_ca_file": tls.ca, "tls_client_cert": tls.cert, "tls_client_key": tls.key}
+    security = Security(require_encryption=True, **{name: str(path) for name, path in files.items()})
+    try:
+        context = security.get_connection_args("client")["ssl_context"]
+    except OSError as error:
+        raise ExperimentError(f"--dask {address}: the files of --tls are no certificates and key ({error})") from None
+    if context is None:
+        raise ExperimentError(f"--dask {address}: give --tls CA CERT KEY, or Dask's own configuration of TLS")
+    return security
 
 
 def _scheduler(address: str) -> str:
@@ -212,8 +267,18 @@ class _Cluster:
         if isinstance(answer, Greeting):
             self._meet(worker, answer)
         else:
-            worker.task = None
+            yield from self._accept(worker, answer)
+
+    def _accept(self, worker: _RemoteWorker, answer: object) -> Iterator[Finished]:
+        """Take the result of a worker's task; what is no result of it fails the task."""
+        task, worker.task = worker.task, None
+        if task is None:
+            return
+        if isinstance(answer, Finished) and task.answered_by(answer):
             yield answer
+        else:
+            cause = f"worker {worker.address} gave {type(answer).__name__}, which is no result of this run"
+            yield Finished([task.row("failed", cause) | _provenance(worker)])
 
     def _meet(self, worker: _RemoteWorker, answer: Greeting) -> None:
         """Accept a worker whose versions are those of this process; its rows would otherwise name the wrong ones."""

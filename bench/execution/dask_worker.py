@@ -15,8 +15,6 @@ import signal
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from multiprocessing.connection import wait
-from time import monotonic
 from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
@@ -70,7 +68,7 @@ def do(sweep: str, task: bytes) -> Finished:
 
     Recordings are read from the task's folder if it exists on this machine, else from FATHOM_DATA.
     """
-    from .pool import Worker
+    from .pool import Worker, next_finished
 
     with _SweepWorker.lock:  # one run at a time even with several threads, or timings would be wrong
         if sweep in _SweepWorker.dismissed:
@@ -80,9 +78,8 @@ def do(sweep: str, task: bytes) -> Finished:
             _SweepWorker.worker, _SweepWorker.sweep = Worker(), sweep
         worker = _SweepWorker.worker
         worker.begin(_with_data_here(pickle.loads(task)))
-        wait([worker.child.connection], max(0.0, worker.give_up_s - monotonic()))
-        finished = worker.collect()
-        if worker.task is not None or sweep in _SweepWorker.dismissed:  # it did not survive, or is needed no longer
+        finished = next_finished([worker], worker.answers)
+        if worker.lost or sweep in _SweepWorker.dismissed:  # it did not survive, or is needed no longer
             _let_go()
         return finished
 

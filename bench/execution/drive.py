@@ -5,24 +5,31 @@ from __future__ import annotations
 import gc
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from time import perf_counter_ns
+from traceback import format_exception
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.epochs import Epoch, Voyage, cut
-from ...datasets.errors import one_line
+from ...datasets.errors import shown
 from ...datasets.log import AttitudeStream, HeadingStream, Log
+from ...datasets.read_only import read_only
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Belief, TimeArray
 from ...datasets.trajectory import Trajectory
+from ...estimators.contract import check_estimator, check_pass, checked_counts
 from ...estimators.interface import Diverged, Estimator, Pass
+from ...estimators.other_code import process_kept
 from ...estimators.physics.imu import compile_rig
 from ...estimators.physics.innovation import INNOVATION, innovations
+from ...estimators.registry import is_ours
+from ..results.identity import content_sha256
 from .noticed import ON_TIME_NS, late_readings, noticed
+from .outputs import check_form, check_smoothed, wrong_value
 from .result import Result, Status
 
 LOST_M = 1e7
@@ -35,6 +42,16 @@ class Ending(NamedTuple):
     status: Status
     cause: str | None = None
     t_ns: int | None = None
+    traceback: str | None = None
+
+    @staticmethod
+    def by(error: BaseException, t_ns: int) -> Ending:
+        """Return the ending by an error of the estimator; an interruption by the user is raised again."""
+        if isinstance(error, KeyboardInterrupt):
+            raise error
+        if isinstance(error, Diverged):
+            return Ending("diverged", shown(_message(error)), t_ns)
+        return Ending("failed", describe(error), t_ns, traceback_of(error))
 
 
 class Recorder:
@@ -54,9 +71,9 @@ class Recorder:
 
         Raises:
             Diverged: it is not finite, is farther than LOST_M away, or has no covariance although the first one had.
-            ValueError: its time is not t_ns.
+            TypeError, ValueError: it is no belief of t_ns, see `check_form`.
         """
-        _check_time(belief, t_ns)
+        check_form(belief, t_ns)
         k, state = len(self.belief_ns), belief.state
         self.t_ns[k], self.R_WB[k], self.P[k] = t_ns, state.R_WB, belief.P
         row = self.vectors[k]
@@ -139,7 +156,9 @@ def run_log(
 ) -> Result:
     """Drive an estimator through a log, in the order of reception.
 
-    Any exception of the estimator ends the run, not the caller; KeyboardInterrupt and the like pass through.
+    Any exception of the estimator ends the run, not the caller; only KeyboardInterrupt passes. Another package's
+    estimator is checked before and its output after: see `contract` and `outputs`. It gets read-only copies, and if it
+    changes the log nevertheless, the run fails and has no trajectory.
 
     Args:
         log: where it states no prior, `initialise` makes one.
@@ -158,23 +177,32 @@ def run_log(
     """
     log, start, notes = _with_prior(log)
     assert log.prior is not None
-    readings = sum(len(stream) for sensor, stream in log.streams.items() if sensor in estimator.factors)
     limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
-    smoothed, finish_ns, counts = None, 0, {}
-    collector = NisCollector(estimator, log.rig) if nis else None
-    with _collector_off():
-        voyage = cut(log, score_ticks(log, score_period_s), estimator.factors, max_gap_s)
+    smoothed, finish_ns, counts, collector = None, 0, {}, None
+    ours = is_ours(estimator)
+    content = None if ours else content_sha256(log)
+    with _collector_off(), nullcontext() if ours else process_kept():
+        factors, ending = _factors(estimator, ours, log.start_ns)
+        readings = sum(len(stream) for sensor, stream in log.streams.items() if sensor in factors)
+        voyage = cut(log, score_ticks(log, score_period_s), factors, max_gap_s)
+        if not ours:
+            voyage = _read_only(voyage)
         recorder = Recorder(sum(epoch.tick for epoch in voyage.epochs))
         try:
-            run = estimator.begin(log.prior, log.rig)
-        except Diverged as error:
-            ending = Ending("diverged", str(error), voyage.start_ns)
-        except Exception as error:
-            ending = Ending("failed", one_line(error), voyage.start_ns)
-        else:
+            if ending is None:
+                collector = NisCollector(estimator, log.rig) if nis else None
+                run = estimator.begin(log.prior, log.rig)
+                if not ours:
+                    check_pass(run, estimator)
+        except BaseException as error:  # another package's code may raise anything
+            ending = Ending.by(error, voyage.start_ns)
+        if ending is None:
             ending = _drive(run, voyage, recorder, limit_ns, collector)
-            smoothed, finish_ns, ending = _finish(run, voyage, ending)
-            counts = dict(run.counts)
+            smoothed, finish_ns, counts, ending = _finish(run, voyage, ending)
+    online, ending = _checked(recorder.trajectory(), ending)
+    if content is not None and content_sha256(log) != content:
+        cause = f"{type(estimator).__name__} changed arrays of the log, the prior or the rig, which other runs use too"
+        online, smoothed, ending = None, None, Ending("failed", cause, ending.t_ns, ending.traceback)
 
     driven = voyage.epochs[: len(recorder.step_ns)]
     end_ns = driven[-1].t_ns if driven else voyage.start_ns
@@ -186,7 +214,7 @@ def run_log(
         ending.status,
         ending.cause,
         None if ending.t_ns is None else (ending.t_ns - voyage.start_ns) * 1e-9,
-        recorder.trajectory(),
+        online,
         smoothed,
         np.array(recorder.step_ns, np.int64),
         np.array(recorder.belief_ns, np.int64),
@@ -197,6 +225,7 @@ def run_log(
         start,
         (*notes, *noticed(log, counts)),
         collector.table() if collector else None,
+        ending.traceback,
     )
 
 
@@ -208,6 +237,32 @@ def _with_prior(log: Log) -> tuple[Log, str, tuple[str, ...]]:
 
     found = initialise(log)
     return log.with_prior(found.belief), found.start, found.notes
+
+
+def _factors(estimator: Estimator, ours: bool, t_ns: int) -> tuple[frozenset[str], Ending | None]:
+    """Return the sensors an estimator may use; or none, and the ending of a run that cannot begin."""
+    try:
+        return estimator.factors if ours else check_estimator(estimator), None
+    except BaseException as error:  # another package's code may raise anything
+        return frozenset(), Ending.by(error, t_ns)
+
+
+def _read_only(voyage: Voyage) -> Voyage:
+    """Return the voyage with read-only copies of its arrays; those of an epoch lead to no later one."""
+    epochs = [
+        epoch._replace(imu=read_only(epoch.imu.copy()), readings=read_only(epoch.readings.copy()))
+        for epoch in voyage.epochs
+    ]
+    return replace(voyage, epochs=epochs)
+
+
+def _checked(online: Trajectory | None, ending: Ending) -> tuple[Trajectory | None, Ending]:
+    """Return the beliefs before the first wrong value of a run that reached the end, and how it ended by that."""
+    wrong = None if online is None or ending.status != "done" else wrong_value(online)
+    if online is None or wrong is None:
+        return online, ending
+    before = online.select(slice(wrong.row)) if wrong.row else None
+    return before, Ending(wrong.status, f"belief(): {wrong.cause}", int(online.t_ns[wrong.row]))
 
 
 def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, collector: NisCollector | None) -> Ending:
@@ -236,30 +291,69 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
                 recorder.keep(belief, t_ns)
                 recorder.belief_ns.append(ended - started)
                 gc.collect(0)
-    except Diverged as error:
-        return Ending("diverged", str(error), t_ns)
-    except Exception as error:
-        return Ending("failed", one_line(error), t_ns)
+    except BaseException as error:  # another package's code may raise anything
+        return Ending.by(error, t_ns)
     if voyage.failure is not None:
         return Ending("failed", voyage.failure, t_ns)
     return Ending("done")
 
 
-def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | None, int, Ending]:
-    """Return (smoothed trajectory, time it took, ending); a run that had ended early keeps its own cause."""
-    started = perf_counter_ns()
-    smoothed = None
+def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | None, int, dict[str, int], Ending]:
+    """Return (smoothed trajectory, time it took, counts, ending); a run that had ended early keeps its own cause."""
+    end_ns = voyage.epochs[-1].t_ns if voyage.epochs else voyage.start_ns
+    smoothed, counts, end = None, {}, Ending("done")
+    started = ended = perf_counter_ns()
     try:
-        smoothed = run.finish()
-        if smoothed is not None and not (np.abs(smoothed.p_WB_W).max(initial=0.0) < LOST_M):  # nor NaN
-            smoothed = None
-            raise Diverged("the smoothed state is not finite, or far beyond the Earth's surface")
-    except Exception as error:
-        if ending.status == "done":
-            lost = isinstance(error, Diverged)
-            end_ns = voyage.epochs[-1].t_ns if voyage.epochs else voyage.start_ns
-            ending = Ending("diverged" if lost else "failed", str(error) if lost else one_line(error), end_ns)
-    return smoothed, perf_counter_ns() - started, ending
+        try:
+            smoothed = run.finish()
+        finally:
+            ended = perf_counter_ns()
+            counts = checked_counts(run, type(run).__name__)
+        if smoothed is not None:
+            end = _smoothed_ending(smoothed, voyage)
+    except BaseException as error:  # another package's code may raise anything
+        end = Ending.by(error, end_ns)
+    if end.status != "done":
+        smoothed = None
+    return smoothed, ended - started, counts, end if ending.status == "done" else ending
+
+
+def _smoothed_ending(smoothed: Trajectory, voyage: Voyage) -> Ending:
+    """Return how a run ends with these smoothed states: done, unless one of them cannot be.
+
+    Raises:
+        Diverged, TypeError, ValueError: they are lost, or no states at the ticks.
+    """
+    check_smoothed(smoothed, np.array([epoch.t_ns for epoch in voyage.epochs if epoch.tick], np.int64))
+    if not (np.abs(smoothed.p_WB_W).max(initial=0.0) < LOST_M):  # nor NaN
+        raise Diverged("the smoothed state is not finite, or far beyond the Earth's surface")
+    wrong = wrong_value(smoothed)
+    if wrong is None:
+        return Ending("done")
+    return Ending(wrong.status, f"finish(): {wrong.cause}", int(smoothed.t_ns[wrong.row]))
+
+
+LONGEST_CAUSE = 2000
+"""Characters of an error's message that are kept: a page."""
+LONGEST_TRACEBACK = 20_000
+"""Characters of a traceback that are kept, its end: some two hundred frames."""
+
+
+def describe(error: BaseException) -> str:
+    """Return type and message of an error, on one line."""
+    return shown(f"{type(error).__name__}: {_message(error)}")
+
+
+def traceback_of(error: BaseException) -> str:
+    """Return the end of an error's traceback, as Python prints it."""
+    return "".join(format_exception(error))[-LONGEST_TRACEBACK:]
+
+
+def _message(error: BaseException) -> str:
+    try:
+        return " ".join(str(error).split())[:LONGEST_CAUSE]
+    except Exception:  # another package's class of errors may raise anything here
+        return "(its message cannot be shown)"
 
 
 @contextmanager

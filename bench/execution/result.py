@@ -39,6 +39,7 @@ class Result:
             and after a comma what is unusual in that.
         notes: how the start was found and what was noticed of the readings, in sentences; see `datasets.notes.Note`.
         nis: INNOVATION rows, in the order of reception; None where they were not asked for.
+        traceback: of the error that ended it; None for any other ending.
     """
 
     status: Status
@@ -55,6 +56,7 @@ class Result:
     start: str = "given"
     notes: tuple[str, ...] = ()
     nis: NDArray[Any] | None = None
+    traceback: str | None = None
 
     @property
     def outputs(self) -> dict[str, Trajectory]:

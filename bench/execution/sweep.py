@@ -25,7 +25,7 @@ from ..inspection.findings.finding import Finding
 from ..results.identity import FINAL, content_sha256
 from ..results.store import Row, Store, provenance, sole_writer, with_whole_specs
 from .cold_start import compile_first
-from .dask_pool import run_on_cluster
+from .dask_pool import Tls, run_on_cluster
 from .log_check import Findings, check_log, note_of, report
 from .pool import run_all
 from .task import Finished, Task
@@ -70,11 +70,11 @@ def run_experiment(
     dask: str | None = None,
     check: bool = True,
     strict: bool = False,
+    tls: Tls | None = None,
 ) -> pd.DataFrame:
     """Run every estimator on every log and return the rows of the store, one per run and output; see `sweep`."""
-    return with_whole_specs(
-        sweep(experiment, data, out, jobs, only, repair, force, dask, check=check, strict=strict).rows
-    )
+    outcome = sweep(experiment, data, out, jobs, only, repair, force, dask, check=check, strict=strict, tls=tls)
+    return with_whole_specs(outcome.rows)
 
 
 def sweep(
@@ -89,6 +89,7 @@ def sweep(
     finished_log: Callable[[pd.DataFrame], None] | None = None,
     check: bool = True,
     strict: bool = False,
+    tls: Tls | None = None,
 ) -> Outcome:
     """Run what the store lacks, and return its rows.
 
@@ -109,9 +110,10 @@ def sweep(
         check: look for gross faults in recorded logs before anything runs. They are said on standard error, and are
             among the notes of the log's rows.
         strict: refuse to run if the check finds any.
+        tls: certificates for a scheduler at a tls:// address, see `dask_pool`.
 
     Raises:
-        ExperimentError, EstimatorError, DatasetError: nothing was run.
+        ExperimentError, EstimatorError, DatasetError: nothing was run; or, at the end, a planned run has no result.
         StoppedError: a result could not be kept, as on a full disk; those before it are in the store.
     """
     if not isinstance(experiment, Experiment):
@@ -136,7 +138,7 @@ def sweep(
         for batch in _batches(missing, duration_s):
             if dask in (None, "local"):
                 compile_first(task.run.estimator.create() for task in batch)
-            ended = run_all(batch, jobs) if dask is None else run_on_cluster(batch, dask, jobs, progress.say)
+            ended = run_all(batch, jobs) if dask is None else run_on_cluster(batch, dask, jobs, progress.say, tls)
             with progress, closing(ended):
                 for each in ended:
                     progress.advance(_keep(each, store, folder))
@@ -148,7 +150,25 @@ def sweep(
         _sweep(folder / "trajectories", store)
         if missing or absent:
             rows = store.read()
-        return Outcome(rows_of(rows, runs), len(tasks) - len(missing), renewed, kept, len(missing))
+        rows = rows_of(rows, runs)
+        _refuse_silence(runs, rows)
+        return Outcome(rows, len(tasks) - len(missing), renewed, kept, len(missing))
+
+
+def _refuse_silence(runs: Sequence[Run], rows: pd.DataFrame) -> None:
+    """Refuse to end as if all were well where a planned run has no row.
+
+    Raises:
+        ExperimentError: names the first such run.
+    """
+    seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
+    told = set(zip(rows["log"], rows["label"], seeds, strict=True))
+    silent = [run for run in runs if (run.log.name, run.estimator.label, run.seed) not in told]
+    if silent:
+        raise ExperimentError(
+            f"{len(silent)} of {len(runs)} planned runs have no result, the first is {silent[0]}; finished runs are "
+            "kept, and the same command continues"
+        )
 
 
 def _batches(tasks: Sequence[Task], duration_s: dict[str, float]) -> list[list[Task]]:

@@ -74,24 +74,58 @@ class Task:
         """The identity of the run, see `identity.identity`."""
         return identity(self.spec, package_of(self.run.estimator.name), self.readings_sha256)
 
-    def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
-        """Return the columns of a row that do not depend on success."""
+    def answered_by(self, answer: object) -> bool:
+        """Return whether what came back from a worker is a result of this task and of no other."""
+        return (
+            isinstance(answer, Finished)
+            and len(answer.rows) > 0
+            and all(isinstance(row, dict) and self._names.items() <= row.items() for row in answer.rows)
+            and all(Path(name).name == name for name in answer.files)
+        )
+
+    @property
+    def _names(self) -> dict[str, Any]:
+        """The columns of a row that say of which run it is."""
         run = self.run
         return {
             "experiment": self.experiment,
             "log": run.log.name,
             "label": run.estimator.label,
             "seed": run.seed,
-            "output": output,
-            "status": status,
-            "cause": None if cause is None else shown(cause),
-            "align": self.scoring.align,
-            "dims": self.scoring.dims,
-            "estimator": run.estimator.name,
             "identity": self.identity,
-            "spec": json.dumps(self.spec),
-            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        } | provenance()
+        }
+
+    def row(self, status: str, cause: str | None, output: str = "online") -> dict[str, Any]:
+        """Return the columns of a row that do not depend on success."""
+        return (
+            self._names
+            | {
+                "output": output,
+                "status": status,
+                "cause": None if cause is None else shown(cause),
+                "align": self.scoring.align,
+                "dims": self.scoring.dims,
+                "estimator": self.run.estimator.name,
+                "spec": json.dumps(self.spec),
+                "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            }
+            | provenance()
+        )
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What a worker begins to do for a task.
+
+    Attributes:
+        identity: of the run.
+        doing: in words.
+        longest_s: how long it may take before the worker counts as hung.
+    """
+
+    identity: str
+    doing: str
+    longest_s: float
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,9 @@ import ctypes
 import gc
 import json
 import math
+import os
 from collections import OrderedDict
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from multiprocessing.connection import Connection
@@ -15,11 +17,12 @@ from platform import node
 
 import numpy as np
 
-from ...datasets.errors import DatasetError, one_line
+from ...datasets.errors import DatasetError
 from ...datasets.log import Log
 from ...datasets.notes import Note, as_data
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
+from ...estimators.registry import ESTIMATORS
 from ..experiment.plan import plain
 from ..metrics import ScoreError
 from ..metrics.consistency import nees_at
@@ -28,28 +31,42 @@ from ..metrics.floor_ratio import FLOORS, floor_scores
 from ..metrics.scoring import INNOVATIONS, by_reason, can_judge, scored
 from ..results.identity import content_sha256
 from ..results.store import Row
-from .drive import run_log, warm_up
+from .drive import describe, run_log, traceback_of, warm_up
 from .result import Result, costs, innovation_dof, innovation_scores
-from .task import Finished, Task, file_name, parquet
+from .task import Finished, Stage, Task, file_name, parquet
 
 LOGS_KEPT = 2
 """How many logs a worker keeps in memory, so that estimators share them: the present one and the one before."""
 
+COMPILE_S = 120.0
+"""How long compiling one of our estimators may take beyond a run's own time, s; it takes half a minute on two cores."""
+
+SCORE_S = 120.0
+"""How long scoring may take beyond a run's own time, s; it takes seconds, and a floor a minute."""
+
 
 def work(connection: Connection) -> None:
     """Do tasks until the connection closes."""
-    cache = WorkerCache()
+    cache, process = WorkerCache(connection.send), os.getpid()
     while True:
         try:
-            connection.send(cache.execute(connection.recv()))
+            finished = cache.execute(connection.recv())
+            if os.getpid() != process:  # an estimator has forked: there is one answer, and not from here
+                os._exit(1)
+            connection.send(finished)
         except (EOFError, OSError):
             return
 
 
 class WorkerCache:
-    """Kept by a worker between tasks: the last logs, their floors and truths, and compiled estimators."""
+    """Kept by a worker between tasks: the last logs, their floors and truths, and compiled estimators.
 
-    def __init__(self) -> None:
+    Args:
+        tell: called with every stage of a task.
+    """
+
+    def __init__(self, tell: Callable[[Stage], object] = lambda stage: None) -> None:
+        self.tell = tell
         self.logs: OrderedDict[str, Log] = OrderedDict()
         self.floors: dict[str, dict[float, Floor]] = {}
         self.truth: dict[str, bytes] = {}
@@ -59,8 +76,12 @@ class WorkerCache:
         """Do one run and return its rows and trajectories; an error becomes a row."""
         started = datetime.now(UTC).isoformat(timespec="seconds")
         try:
+            self._enter(task, "opening the log")
             log = self.open(task)
+            ours = task.run.estimator.name in ESTIMATORS
+            self._enter(task, "warming up", COMPILE_S if ours else 0.0)
             estimator = self.estimator(task)
+            self._enter(task, "running the estimator")
             with _PeakMemory() as memory:
                 result = run_log(
                     log,
@@ -70,9 +91,16 @@ class WorkerCache:
                     timeout_s=task.timeout_s,
                     nis=task.scoring.nis,
                 )
+            if not ours and result.status == "failed":
+                self.logs.clear()  # it may have changed them
+            self._enter(task, "scoring", SCORE_S)
             return self.finished(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
-        except Exception as error:
-            return Finished([task.row("failed", one_line(error)) | {"started": started}])
+        except (Exception, SystemExit) as error:  # another package's code may raise anything, or exit
+            row = task.row("failed", describe(error)) | {"started": started, "traceback": traceback_of(error)}
+            return Finished([row])
+
+    def _enter(self, task: Task, doing: str, extra_s: float = 0.0) -> None:
+        self.tell(Stage(task.identity, doing, task.timeout_s + extra_s))
 
     def open(self, task: Task) -> Log:
         """Open or simulate the task's log, unless it is one of the last.
@@ -130,6 +158,7 @@ class WorkerCache:
         checked = [Note(text, "check", text.partition(":")[0]) for text in task.checked]
         shared = {
             "failed_at_s": result.failed_at_s,
+            "traceback": result.traceback,
             "truth_kind": log.truth_kind if log.truth is not None else None,
             "duration_s": result.duration_s,
             "start": result.start,

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from ...datasets.errors import DatasetError, complaints, nearest
-from ...datasets.yaml_file import read_yaml
+from ...datasets.formats.yaml_file import read_yaml
 from ..errors import ExperimentError
 from ..metrics.comparison import Comparison
 from ..metrics.scoring import Scoring

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ...datasets.compiled import compiled
+from ...datasets.compiling.decorators import compiled
 from ...datasets.epochs import IMU_SAMPLE, READING, Epoch, cut
 from ...datasets.log import Log
 from ...datasets.simulated.scenario import Scenario

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from textwrap import shorten
 
@@ -15,8 +16,11 @@ CAUSE_WIDTH = 160
 
 
 def failures(rows: Sequence[Record]) -> list[str]:
-    """Return a line for each run that did not finish; a recording that is not here has one line in all."""
-    lines = []
+    """Return a line for each run that did not finish; a recording that is not here has one line in all.
+
+    The first with a traceback, by label and cause, says where it ends.
+    """
+    lines, placed = [], set()
     for (log, label, seed), (row, *_) in groups(rows, "log", "label", "seed").items():
         if row["status"] == "absent":
             lines.append(absence(log, row["cause"]))
@@ -24,9 +28,19 @@ def failures(rows: Sequence[Record]) -> list[str]:
             of_seed = "" if seed is None else f" seed {seed}"
             when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
             part = "; scored up to there" if ended_at_gap(row) else ""
+            kind, place = (label, row["cause"]), ""
+            if row["traceback"] and kind not in placed:
+                placed.add(kind)
+                place = f" ({_place(row['traceback'])}; the column `traceback` of runs.sqlite has all)"
             why = shorten(row["cause"] or NO_CAUSE, CAUSE_WIDTH)
-            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {why}{part}")
+            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {why}{part}{place}")
     return list(dict.fromkeys(lines))
+
+
+def _place(traceback: str) -> str:
+    """Return the innermost place of a traceback: file, line and function."""
+    found = re.findall(r'^  File "(?:.*/)?(.+)", line (\d+), in (.+)$', traceback, re.MULTILINE)
+    return "{}, line {}, in {}".format(*found[-1]) if found else "no place is known"
 
 
 def absence(log: str, cause: str | None) -> str:

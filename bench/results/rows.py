@@ -21,6 +21,7 @@ NAMES = {"experiment": "TEXT", "log": "TEXT", "label": "TEXT", "seed": "INTEGER"
 OUTCOME = {
     "status": "TEXT",  # one of STATUSES
     "cause": "TEXT",
+    "traceback": "TEXT",  # of the error that ended the run
     "failed_at_s": "REAL",
     "lookahead_s": "REAL",
     "truth_kind": "TEXT",

@@ -16,12 +16,12 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_va
 from ..errors import DatasetError, complaints, nearest
 from ..formats.recording import Recording, loader
 from ..formats.table import Column, Part, Table
+from ..formats.yaml_file import read_yaml
 from ..mounting import Matrix, MountingSpec
 from ..quantities import DEGREE, Finite, Latitude, Longitude, NotNegative, Number, Positive, Vector, Whole
 from ..rig import ImuNoise
 from ..rotations import complaint, is_rotation, note, off_rotation, orthonormalised
 from ..state import LIMIT_NS, Array, Belief, NavState
-from ..yaml_file import read_yaml
 
 Sigma = Annotated[Number, Field(gt=0)]
 """Infinite for a component that is not measured."""

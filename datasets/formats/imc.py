@@ -19,7 +19,7 @@ from typing import IO, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..compiled import compiled
+from ..compiling.decorators import compiled
 from ..errors import DatasetError, nearest, shown
 from ..files import inside
 from .recording import Messages, Recording, TopicInfo, Wanted, not_found

@@ -15,7 +15,6 @@ from typing import Any
 
 from ..errors import DatasetError, nearest, nearest_file, one_line
 from ..files import inside, regular_file
-from ..yaml_file import read_yaml
 from .mcap_file import mcap_messages
 from .recording import extra
 from .ros1_bag import ros1_messages
@@ -23,6 +22,7 @@ from .ros2_database import sqlite_messages
 from .ros_messages import MOST_DEFINITION, Definition, Definitions, Types, parse_definitions
 from .topics import Message, ScanResult, TopicRecording
 from .unpacking import Unpacking
+from .yaml_file import read_yaml
 
 DISTRO = "humble"
 """The ROS 2 distribution whose definitions are used if a bag does not name one."""

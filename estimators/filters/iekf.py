@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.epochs import DVL, GPS
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, POSITION, THETA, VELOCITY, Array, Belief

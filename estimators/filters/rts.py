@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-from ...datasets.compiled import compiled
+from ...datasets.compiling.decorators import compiled
 from ...datasets.epochs import Epoch
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, THETA, Array, Belief

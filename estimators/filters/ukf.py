@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from ...datasets.compiled import compiled
+from ...datasets.compiling.decorators import compiled
 from ...datasets.quantities import NotNegative, Number
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Array, Belief

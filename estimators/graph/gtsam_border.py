@@ -17,7 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, L, V, X
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged, unknown_kind

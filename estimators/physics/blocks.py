@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets.compiled import compiled
+from ...datasets.compiling.decorators import compiled
 from ...datasets.state import Array
 
 TOP: Any = np.int64(0)

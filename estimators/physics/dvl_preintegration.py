@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import Array, TimeArray
 from .blocks import clear, identity
 from .imu import HELD_RATE, turn_by

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import DIM, Array
 
 NO_VARIANCE = 1e-14

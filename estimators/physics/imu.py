@@ -41,7 +41,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.epochs import IMU_SAMPLE
 from ...datasets.rig import Rig
 from ...datasets.state import DIM, Array

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled
+from ...datasets.compiling.decorators import compiled
 from ...datasets.epochs import SENSOR
 from ...datasets.state import DIM, Array, Belief
 from .elimination import normalised_square, project

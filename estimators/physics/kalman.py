@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled
+from ...datasets.compiling.decorators import compiled
 from ...datasets.state import DIM
 from .elimination import absorb
 from .imu import integrate, predict, process_noise, sandwich

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING
 from ...datasets.state import Array
 from .blocks import TOP, clear, set_block, set_product

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import Array
 
 SMALL = 1e-4

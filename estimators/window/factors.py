@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import compiled, inner
+from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import DIM, THETA, Array
 from ..physics.blocks import clear
 from ..physics.elimination import add_scaled, decorrelate

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.compiled import Records, compiled, inner
+from ...datasets.compiling.decorators import Records, compiled, inner
 from ...datasets.state import DIM
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME
 from ..physics.elimination import absorb_row, divide_into

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fathom.datasets import compiled_cache
-from fathom.datasets.compiled import compiled
-from fathom.datasets.compiled_cache import code_of, compiled_folder, key_of
+from fathom.datasets.compiling import cache as compiled_cache
+from fathom.datasets.compiling.cache import code_of, compiled_folder, key_of
+from fathom.datasets.compiling.decorators import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 CALL = """
@@ -20,14 +20,14 @@ from fathom.estimators.physics.calling import caller
 print(caller(1.0), sum(caller.stats.cache_hits.values()), caller.stats.cache_path)
 """
 CALLED = """
-from fathom.datasets.compiled import compiled
+from fathom.datasets.compiling.decorators import compiled
 
 @compiled
 def callee(x):
     return x + 1.0
 """
 CALLING = """
-from fathom.datasets.compiled import compiled
+from fathom.datasets.compiling.decorators import compiled
 from .called import callee
 
 @compiled

@@ -9,6 +9,8 @@ import os
 import pickle
 import re
 import signal
+import socket
+import ssl
 import subprocess
 import sys
 import threading
@@ -18,17 +20,20 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import pandas as pd
 import pytest
 from distributed import Client
+from distributed.security import Security
 from fathom.bench.cli.app import app
 from fathom.bench.errors import ExperimentError
 from fathom.bench.execution import dask_pool as cluster
 from fathom.bench.execution import dask_worker as remote
 from fathom.bench.execution.pool import Queue, log_of
 from fathom.bench.execution.sweep import run_experiment, sweep
-from fathom.bench.execution.task import Task
+from fathom.bench.execution.task import Finished, Task
 from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
 from fathom.bench.metrics.scoring import SCORES
@@ -270,6 +275,79 @@ def test_the_command_runs_on_a_cluster_of_its_own(tmp_path: Path, site: Path) ->
     assert load_runs(tmp_path / "out" / "e")["status"].tolist() == ["done", "done"]
 
 
+@pytest.fixture
+def certificates(tmp_path: Path) -> list[str]:
+    """The files of an authority's certificate, of one for all roles, and of its key."""
+    made = Security.temporary()
+    texts = (made.tls_ca_file, made.tls_client_cert, made.tls_client_key)
+    files = [tmp_path / name for name in ("ca.pem", "cert.pem", "key.pem")]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(str(text))
+    return [str(file) for file in files]
+
+
+def knock(address: str, context: ssl.SSLContext) -> bytes:
+    """Return what a scheduler says to somebody on this machine; TLS 1.3 refuses a client after its handshake."""
+    host, _, port = address.rpartition("://")[2].partition(":")
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with (
+        socket.create_connection((host, int(port)), timeout=30) as plain,
+        context.wrap_socket(plain, server_hostname=host) as hidden,
+    ):
+        return hidden.recv(1)
+
+
+@pytest.mark.slow
+def test_a_cluster_on_this_machine_lets_nobody_else_in() -> None:
+    with cluster._connected("local", 1) as client:
+        assert client.scheduler is not None
+        address = client.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        assert all(worker.startswith("tls://127.0.0.1:") for worker in client.nthreads())
+        of_another = Security.temporary().get_connection_args("client")["ssl_context"]
+        for context in (ssl.create_default_context(), of_another):
+            with pytest.raises((ssl.SSLError, ConnectionError)):
+                knock(address, context)
+        for page in client.run_on_scheduler(pages), *client.run(pages).values():
+            with pytest.raises(HTTPError, match="404"):
+                urlopen(page, timeout=30)
+
+
+def pages(dask_scheduler: Any = None, dask_worker: Any = None) -> str:
+    return f"http://127.0.0.1:{(dask_scheduler or dask_worker).http_server.port}/health"
+
+
+@pytest.mark.slow
+def test_a_cluster_behind_tls_is_reached_by_the_files_on_the_command(tmp_path: Path, certificates: list[str]) -> None:
+    ca, cert, key = certificates
+    tls = ["--tls-ca-file", ca, "--tls-cert", cert, "--tls-key", key, "--no-dashboard", "--protocol", "tls"]
+    scheduler, file = str(tmp_path / "scheduler.json"), tmp_path / "e.yaml"
+    file.write_text(json.dumps({"logs": [SHORT], "estimators": [{"name": "dead-reckoning"}]}))
+    here = ["--nthreads", "1", "--local-directory", str(tmp_path)]
+    with (
+        started("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", scheduler, *tls),
+        started("dask_worker", "--scheduler-file", scheduler, *here, *tls),
+    ):
+        give_up_s = time.monotonic() + 60
+        while not Path(scheduler).exists() and time.monotonic() < give_up_s:
+            time.sleep(0.05)
+        command = ["run", str(file), "--out", str(tmp_path), "--dask", scheduler, "--tls", *certificates]
+        result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+
+
+def test_a_result_of_another_run_fails_the_run_that_was_asked_for() -> None:
+    plan = experiment(estimators=[{"name": "dead-reckoning"}, {"name": "eskf"}])
+    task, other = (Task.of(plan, run) for run in plan.runs())
+    pool = object.__new__(cluster._Cluster)
+    for answer in (Finished([other.row("done", None)]), Finished([]), "done", None):
+        worker = cluster._RemoteWorker("tcp://there:1", None, task=task)  # type: ignore[arg-type]
+        (finished,) = pool._accept(worker, answer)
+        (row,) = finished.rows
+        assert (row["status"], row["label"], worker.task) == ("failed", "dead-reckoning", None)
+        assert "which is no result of this run" in row["cause"]
+
+
 # -- what needs no cluster --------------------------------------------------------------------------------------------
 
 
@@ -280,6 +358,9 @@ def test_the_command_runs_on_a_cluster_of_its_own(tmp_path: Path, site: Path) ->
         ("nowhere", [], "no Dask scheduler answers"),
         ("gone.json", [], "gone.json: not a scheduler file (FileNotFoundError"),
         ("tcp://127.0.0.1:9", ["--jobs", "3"], "--jobs 3: only for --dask local; the cluster at"),
+        ("tcp://127.0.0.1:9", ["--tls", "a", "b", "c"], "--tls is for an address tls://host:port"),
+        ("tls://127.0.0.1:9", [], "give --tls CA CERT KEY, or Dask's own configuration of TLS"),
+        ("tls://127.0.0.1:9", ["--tls", "a", "b", "c"], "the files of --tls are no certificates and key"),
     ],
 )
 def test_an_address_where_no_scheduler_is_gets_one_line_and_status_2(

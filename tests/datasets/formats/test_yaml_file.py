@@ -9,9 +9,10 @@ import pytest
 import yaml
 from fathom.bench.errors import ExperimentError
 from fathom.bench.experiment.plan import Experiment
-from fathom.datasets import DatasetError, yaml_file
+from fathom.datasets import DatasetError
 from fathom.datasets.described.description import read_description
-from fathom.datasets.yaml_file import MOST_BYTES, parse_yaml, read_yaml
+from fathom.datasets.formats import yaml_file
+from fathom.datasets.formats.yaml_file import MOST_BYTES, parse_yaml, read_yaml
 from limited import limited
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias, TypeVar
 
 from numba import njit as typed_njit
 
-from .compiled_cache import CodeCache, NoPlaceError
+from .cache import CodeCache, NoPlaceError
 
 Records: TypeAlias = Any
 """An array of records; NumPy's types know nothing of their fields."""

@@ -32,9 +32,7 @@ import numpy as np
 import platformdirs
 from numba.core import caching, config
 
-from .errors import one_line
-
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 KEPT = 20
 """How many states of the sources keep their compiled code, 10 to 30 MB each; the one used longest ago goes first."""
 
@@ -42,7 +40,9 @@ KEPT = 20
 @cache
 def read_sources() -> dict[Path, str]:
     """Return the files that compiled code is made from, as they were first read: a log's types and the estimators."""
-    paths = [*sorted((ROOT / "datasets").glob("*.py")), *sorted((ROOT / "estimators").rglob("*.py"))]
+    folders = (ROOT / "datasets", ROOT / "datasets" / "compiling")
+    paths = [path for folder in folders for path in sorted(folder.glob("*.py"))]
+    paths += sorted((ROOT / "estimators").rglob("*.py"))
     return {path: path.read_text(encoding="utf-8") for path in paths}
 
 
@@ -229,7 +229,9 @@ class CodeCache(caching.FunctionCache):
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # a damaged pickle raises many kinds
-            _warn_once(f"{self.cache_path}: compiled code cannot be read ({one_line(error)}); it is compiled anew")
+            _warn_once(
+                f"{self.cache_path}: compiled code cannot be read ({type(error).__name__}: {error}); it is compiled anew"
+            )
             with suppress(OSError):
                 self.flush()
             return None

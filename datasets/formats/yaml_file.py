@@ -14,8 +14,8 @@ from typing import Any
 
 import yaml
 
-from .errors import DatasetError, shown
-from .files import regular_file
+from ..errors import DatasetError, shown
+from ..files import regular_file
 
 MOST_BYTES = 16 << 20
 """Of a file; an experiment of 1000 logs with every key spelled out has 5 MB."""
