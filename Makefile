@@ -6,7 +6,7 @@ PYTHON ?= python3
 DATA := $(firstword $(FATHOM_DATA) $(wildcard ../shared/data))
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-PINS := uv pip compile --generate-hashes --no-header --no-annotate --no-emit-index-url --quiet --python-version 3.11
+PINS := $(BIN)/uv pip compile --generate-hashes --no-header --no-annotate --no-emit-index-url --quiet --python-version 3.11
 PYTEST := $(BIN)/python -m pytest -q -n auto --dist worksteal
 
 # Python keeps the bytecode it compiles, whatever the shell says: dozens of processes read the same sources
@@ -56,7 +56,7 @@ warm: .venv/dev
 	touch $@
 
 # after a change of dependencies; what is pinned stays, as long as it fits
-pins:
+pins: .venv/dev
 	$(PINS) --universal --extra dev pyproject.toml --output-file constraints.txt
 	grep -o '^setuptools==[^ ]*' constraints.txt | $(PINS) --universal --extra report --constraint constraints.txt \
 		pyproject.toml - --output-file constraints-bench.txt
@@ -64,13 +64,14 @@ pins:
 		pyproject.toml - --output-file constraints-lowest.txt
 
 # the lower bounds of pyproject.toml are true: what needs no compiling passes with them
-lowest:
+lowest: .venv/dev
 	rm -rf build/lowest
-	$(PYTHON) -m venv build/lowest
-	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement constraints-lowest.txt
-	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation .
+	$(BIN)/uv venv --quiet --python $(BIN)/python build/lowest
+	$(BIN)/uv pip install --quiet --python build/lowest --require-hashes --requirement constraints-lowest.txt
+	$(BIN)/uv pip install --quiet --python build/lowest --no-deps --no-build-isolation .
 	build/lowest/bin/fathom list experiments >build/lowest/experiments
-	build/lowest/bin/python -m pytest -q -W ignore -m 'not slow' tests/datasets/test_errors.py tests/datasets/test_quantities.py \
+	build/lowest/bin/python -m pytest -q -o addopts=--import-mode=importlib -W ignore -m 'not slow' \
+		tests/datasets/test_errors.py tests/datasets/test_quantities.py \
 		tests/datasets/described/test_conversions.py tests/datasets/formats/test_columns.py \
 		tests/bench/output/test_hostile_text.py
 
