@@ -284,12 +284,13 @@ def _keep(
         short += int(np.count_nonzero(chosen & ~whole))
         if not whole.any():
             continue
-        body = offsets[whole, None] + HEADER.itemsize + np.arange(layout.fields.itemsize)
-        values = data[body].view(layout.fields)[:, 0]
-        kept = np.zeros(len(values), _row_type(layout))
+        kept = np.zeros(np.count_nonzero(whole), _row_type(layout))
         kept["timestamp"], kept["src_ent"] = heads["timestamp"][whole], heads["src_ent"][whole]
-        for field in layout.fields.names or ():
-            kept[field] = values[field]
+        if layout.fields.names:
+            body = offsets[whole, None] + HEADER.itemsize + np.arange(layout.fields.itemsize)
+            values = data[body].view(layout.fields)[:, 0]
+            for field in layout.fields.names:
+                kept[field] = values[field]
         rows[name].append(kept)
     return short
 

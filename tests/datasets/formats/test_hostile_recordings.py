@@ -394,6 +394,15 @@ def test_definitions_of_messages_are_bounded(tmp_path):
         limited(lambda: recording.contents(tmp_path), MEGABYTES)
 
 
+def test_a_message_without_a_field_of_fixed_size_has_its_stamp(tmp_path):
+    (tmp_path / "x.lsf").write_bytes(imc_message("Depth", 1.5, 2.5))
+    (tmp_path / "IMC.xml").write_text("<m><message abbrev='Depth' id='265'><field type='plaintext'/></message></m>")
+    recording = ImcRecording(format="imc", file="x.lsf", definitions="IMC.xml")
+    found = recording.read(tmp_path, [Wanted("Depth", None, ("timestamp",))])
+    assert found.columns[0]["timestamp"].tolist() == [1.5]
+    assert [info.fields for info in recording.contents(tmp_path)] == [()]
+
+
 @pytest.mark.parametrize(
     ("xml", "says"),
     [
