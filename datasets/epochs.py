@@ -134,7 +134,7 @@ def cut(
 
 def _intervals(log: Log, start_ns: int) -> tuple[TimeArray, TimeArray]:
     """Return the time since the sample before (or since the start), and the gap in it, for each sample, (n,) ns."""
-    period_ns, gap = int(log.imu.sampling_ns[0]), log.imu.gaps_ns.copy()
+    period_ns, gap = int(log.imu.t_ns[0]) - log.imu.start_ns, log.imu.gaps_ns
     interval = np.diff(log.imu.t_ns, prepend=min(start_ns, log.imu.start_ns))
     gap[0] = interval[0] - period_ns if interval[0] > GAP_FACTOR * period_ns else 0
     return interval, gap

@@ -36,6 +36,11 @@ def sampling_ns(t_ns: TimeArray) -> TimeArray:
     return _sampling(np.diff(t_ns))[1][_stretch_of(len(t_ns))]
 
 
+def first_sampling_ns(t_ns: TimeArray) -> int:
+    """Return the sampling interval about the first sample, ns."""
+    return int(sampling_ns(t_ns[: STRETCH * STRETCHES + 1])[0])
+
+
 def gaps_ns(t_ns: TimeArray) -> TimeArray:
     """Return how long samples are missing before each sample, (n,) ns; 0 where none is, and before the first.
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DatasetError
-from .imu_time import gaps_ns, sampling_ns
+from .imu_time import first_sampling_ns, gaps_ns, sampling_ns
 from .read_only import make_read_only
 from .rig import Rig
 from .rotations import UNHEARD, complaint, off_rotation
@@ -73,12 +72,12 @@ class ImuStream:
             raise DatasetError(f"imu: {len(self.t_ns)} samples; at least two are needed")
         check_rows("imu", self.t_ns, {"gyro": self.w_WI_I, "accel": self.f_I}, strict=True)
 
-    @cached_property
+    @property
     def sampling_ns(self) -> TimeArray:
         """(n,) sampling interval about each sample; a rate may change during a log."""
         return sampling_ns(self.t_ns)
 
-    @cached_property
+    @property
     def gaps_ns(self) -> TimeArray:
         """(n,) how long samples are missing before each sample, 0 where none is; see `imu_time`."""
         return gaps_ns(self.t_ns)
@@ -86,9 +85,9 @@ class ImuStream:
     @property
     def start_ns(self) -> int:
         """Start of the first sample's interval."""
-        return int(self.t_ns[0] - self.sampling_ns[0])
+        return int(self.t_ns[0]) - first_sampling_ns(self.t_ns)
 
-    @cached_property
+    @property
     def period_ns(self) -> int:
         """Typical sampling interval: the median of `sampling_ns`."""
         return int(np.median(self.sampling_ns))

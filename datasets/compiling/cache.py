@@ -229,9 +229,8 @@ class CodeCache(caching.FunctionCache):
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # a damaged pickle raises many kinds
-            _warn_once(
-                f"{self.cache_path}: compiled code cannot be read ({type(error).__name__}: {error}); it is compiled anew"
-            )
+            why = f"{type(error).__name__}: {error}"
+            _warn_once(f"{self.cache_path}: compiled code cannot be read ({why}); it is compiled anew")
             with suppress(OSError):
                 self.flush()
             return None

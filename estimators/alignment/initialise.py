@@ -109,11 +109,11 @@ def initialise(log: Log, window_s: float = 2.0, max_wait_s: float | None = None)
 
 def _stretches(log: Log) -> Iterator[Stretch]:
     """Yield the parts between the long gaps of the IMU."""
-    imu = log.imu
-    long = imu.gaps_ns > np.maximum(LONGEST_GAP_S * 1e9, LONGEST_GAP_SAMPLES * imu.sampling_ns)
-    firsts = [0, *np.flatnonzero(long).tolist(), len(imu.t_ns)]
+    t_ns, sampling_ns = log.imu.t_ns, log.imu.sampling_ns
+    long = log.imu.gaps_ns > np.maximum(LONGEST_GAP_S * 1e9, LONGEST_GAP_SAMPLES * sampling_ns)
+    firsts = [0, *np.flatnonzero(long).tolist(), len(t_ns)]
     for first, end in pairwise(firsts):
-        yield Stretch(int(imu.t_ns[first] - imu.sampling_ns[first]), int(imu.t_ns[max(end - 2, first)]))
+        yield Stretch(int(t_ns[first] - sampling_ns[first]), int(t_ns[max(end - 2, first)]))
 
 
 def _usable(stretches: Sequence[Stretch], window_s: float) -> list[Stretch]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fathom.datasets.imu_time import gaps_ns, sampling_ns
+from fathom.datasets.imu_time import first_sampling_ns, gaps_ns, sampling_ns
 
 MS = 1_000_000
 N = 12_000
@@ -100,3 +100,8 @@ def test_sampling_follows_the_rate() -> None:
     assert (sampling[0], sampling[-1]) == (10 * MS, 20 * MS)
     assert np.median(sampling_ns(WHOLE["pairs, 5 and 15 ms"])) == 10 * MS
     assert np.median(sampling_ns(rounded(800))) == pytest.approx(1.25 * MS, rel=0.01)
+
+
+@pytest.mark.parametrize("stamps", WHOLE)
+def test_the_first_interval_needs_no_more_than_the_first_stretches(stamps: str) -> None:
+    assert first_sampling_ns(WHOLE[stamps]) == sampling_ns(WHOLE[stamps])[0]
