@@ -69,7 +69,10 @@ def score(
         float, typer.Option(metavar="SECONDS", help="Added to the estimate's times before poses are compared, s.")
     ] = 0.0,
 ) -> None:
-    """Print ATE and RPE of an estimated trajectory, and how many of its poses they are taken over."""
+    """Print ATE and RPE of an estimated trajectory.
+
+    Says how many of its poses they are taken over, and what would match more.
+    """
     from ..metrics import ScoreError, ate, check_step, rpe
 
     check_step(delta, unit.value)
