@@ -144,10 +144,10 @@ def agreement(sketch: Sketch, each: Hypothesis, v_B: Array | None = None) -> flo
 
 
 def _explained(measured: Array, predicted: Array) -> float:
-    """Return the log likelihood of measured − predicted, over that of the measured alone."""
+    """Return the log likelihood of measured − predicted, over that of the measured alone; not below zero."""
     if len(measured) < 10 or measured.std() == 0:
         return 0.0
-    left = float(np.var(measured - predicted) / np.var(measured))
+    left = min(float(np.var(measured - predicted) / np.var(measured)), 1.0)  # a vehicle that banks shows nothing
     return -0.5 * min(len(measured), ROWS) * float(np.log(max(left, 0.02)))
 
 

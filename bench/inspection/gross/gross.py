@@ -15,7 +15,7 @@ from ..findings.advice import clock_fix
 from ..findings.finding import Check, Finding
 from ..streams.norms import NO_GRAVITY, check_norms
 from .axes import CLEARLY, SURELY, agreement, axes_findings, best, hypotheses, is_upright, scale_findings
-from .plane import heading_fits, plane_findings
+from .plane import heading_fits, heard_under_water, plane_findings
 from .relations import tilting, turning
 from .shifts import shift_of
 from .sketch import Sketch, sketch_of
@@ -99,6 +99,8 @@ def _findings(sketch: Sketch) -> list[Finding]:
     suspects = {finding.stream for finding in in_plane}
     vouched = {"dvl"} if agrees else set()
     every = [*in_plane, *vertical_findings(sketch, suspects, vouched)]
+    if not {"gps", "depth"} & {finding.stream for finding in every}:
+        every += heard_under_water(sketch)
     every += [] if every else _imu_yaw(sketch, agrees)
     keys = [(finding.stream, _key(finding)) for finding in every]
     return [finding for k, finding in enumerate(every) if keys[k] not in keys[:k]]

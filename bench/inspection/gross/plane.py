@@ -195,9 +195,10 @@ def plane_findings(sketch: Sketch, turns_right: bool) -> tuple[list[Finding], bo
     usable = [fixes for fixes in every if fixes not in far and _usable(course, heard, fixes)]
     now = [course.match(path, fixes) for fixes in usable]
     agrees = any(m.rms_m < f.allowed_m and abs(m.z - 1) < TURN_MATTERS for m, f in zip(now, usable, strict=True))
+    near: list[Finding] = []
     for match, fixes in zip(now, usable, strict=True):
-        findings += _of_fixes(sketch, course, path, fixes, match, turns_right, agrees)
-    return findings, agrees
+        near += _of_fixes(sketch, course, path, fixes, match, turns_right, agrees)
+    return near or findings, agrees  # W's origin is at the near ones: where those are wrong, the far ones may be right
 
 
 def heading_fits(sketch: Sketch, late_s: float) -> bool:
@@ -238,7 +239,7 @@ def _of_fixes(
         other = _other_coordinates(sketch, course, path, fixes, now, turns_right)
         if other is not None:
             return [other]
-    late = _clock(sketch, course, path, fixes, now) or (_heard_under_water(sketch, fixes) if not agrees else None)
+    late = _clock(sketch, course, path, fixes, now)
     if late is not None:
         return [late]
     if now.rms_m > max(FAR_OFF * fixes.extent_m, 2 * NOISES * fixes.sigma_m) and course.compass:
@@ -273,6 +274,8 @@ def _other_coordinates(
     if _explains(mirrored, now, fixes):
         return _mirrored(log, fixes, now, mirrored, course.compass and turns_right)
     others = [each for each in (mirrored, straight) if each is not None and each.rms_m < now.rms_m / BETTER]
+    if straight is not None and straight.rms_m < now.rms_m / BETTER and _is_plain(straight, course.compass):
+        return _ambiguous(log, fixes, now)
     turn = float(np.angle(now.z))
     only_turned = abs(turn) > TURN_MATTERS and abs(abs(now.z) - 1) < SCALE_MATTERS and _off_the_truth(sketch) is None
     if others and now.rms_m < fixes.allowed_m and course.compass and only_turned:
@@ -289,23 +292,25 @@ def _ambiguous(log: Log, fixes: Fixes, now: Match) -> Finding:
     return Finding(fixes.stream, message)
 
 
-def _heard_under_water(sketch: Sketch, fixes: Fixes) -> Finding | None:
+def heard_under_water(sketch: Sketch) -> list[Finding]:
     """Find fixes stamped while the depth sensor was under water, which another clock would put at the surface."""
     log = sketch.log
-    if fixes.stream != "gps" or log.depth is None or len(log.depth) < 30:
-        return None
+    heard = [fixes for fixes in fixes_of(sketch) if fixes.stream == "gps"]
+    if not heard or log.depth is None or len(log.depth) < 30:
+        return []
+    (fixes,) = heard
     t_s, z = seconds(log, log.depth.t_ns), log.depth.z[:, 0]
     lags = np.arange(-LONGEST_S, LONGEST_S + 1, 1.0)
     deep = (np.interp(fixes.t_s - lags[:, None], t_s, z) < -DEEP_M).mean(axis=1)
     now, none = float(deep[len(lags) // 2]), np.flatnonzero(deep < SOME)
     if now < MANY or not len(none) or np.ptp(none) + 1 > len(none):
-        return None
+        return []
     late_s = float(lags[none].mean())
     message = (
         f"{now:.0%} of the fixes are stamped while the depth sensor is more than {DEEP_M:g} m under water, and none if "
         f"the stamps of the GPS are taken to be {abs(late_s):.0f} s {'late' if late_s > 0 else 'early'}."
     )
-    return Finding("gps", message, clock_fix("gps", late_s))
+    return [Finding("gps", message, clock_fix("gps", late_s))]
 
 
 def _explains(other: Match, now: Match, fixes: Fixes) -> bool:
