@@ -77,12 +77,14 @@ def load_trajectory(path: Path) -> Trajectory:
     """Read a saved trajectory; of its covariance the 3 × 3 blocks are kept, the rest is NaN.
 
     Raises:
-        ValueError: it cannot be read: it is damaged, or there is not enough memory for it.
+        OSError, ValueError, KeyError: it cannot be read: it is damaged, or there is not enough memory for it.
     """
     try:
         return _loaded(path)
     except MemoryError as error:
         raise ValueError(f"there is not enough memory to read it ({error})") from None
+    except (OSError, ValueError, KeyError):
+        raise
     except Exception as error:  # pandas and pyarrow raise many kinds for a file that is not what it seems
         raise ValueError(one_line(error)) from None
 

@@ -450,7 +450,7 @@ def test_causes_beyond_what_one_reads_are_left_to_the_table_of_runs(rows: pd.Dat
         seed=pd.array(range(300), "Int64"), status="failed", cause=[f"unlike the others: {k}" for k in range(300)]
     )
     text = render(every.assign(trajectory=None), folder, ())
-    assert text.count("unlike the others") == 200
+    assert text.count(">unlike the others") == 200
     assert "and 100 more; the table of runs has them all" in text
 
 
