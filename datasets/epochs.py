@@ -160,7 +160,7 @@ def _last_gap(log: Log, start_ns: int, interval: TimeArray, gap: TimeArray, max_
 def _held_s(gap: TimeArray) -> Array:
     """Return for how long each gap (n,) ns counts, s: its length, less where it is short; variance is by its square."""
     gap_s = gap * 1e-9
-    return np.asarray(gap_s * np.minimum(gap_s / STRAYS_S, 1.0) ** 2)
+    return np.asarray(gap_s * np.minimum(gap_s / STRAYS_S, 1.0) ** 2, np.float64)
 
 
 def _imu_table(

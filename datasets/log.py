@@ -21,7 +21,7 @@ from .trajectory import Trajectory
 
 def is_noise(sigma: Array) -> NDArray[np.bool_]:
     """Return (n,): whether all of a row's standard deviations (n, m) are positive."""
-    return (sigma > 0).all(axis=1)
+    return np.all(sigma > 0, axis=1)
 
 
 def check_rows(stream: str, t_ns: TimeArray, columns: Mapping[str, Array], *, strict: bool) -> None:

@@ -38,7 +38,8 @@ class Note(str):
         ValueError: no such kind.
     """
 
-    __slots__ = ("count", "kind", "of", "seconds", "stream")
+    # a note counts rows, as JSON and tables call it, and nobody counts letters in it
+    __slots__ = ("count", "kind", "of", "seconds", "stream")  # pyright: ignore[reportIncompatibleMethodOverride]
 
     kind: str
     stream: str

@@ -116,7 +116,7 @@ def create(name: str, /, **options: Any) -> Estimator:
         if key not in fields:
             raise EstimatorError(f"{name}: no option {key!r}{nearest(key, fields)} (it has: {', '.join(fields)})")
     try:
-        return kind(**options) if name in ESTIMATORS else _of_other_package(kind, options)
+        return ESTIMATORS[name](**options) if name in ESTIMATORS else _of_other_package(kind, options)
     except ValidationError as error:
         raise EstimatorError(f"{name}: {'; '.join(complaints(error, kind))}") from None
     except (Exception, SystemExit) as error:  # another package's class may raise anything, or exit
@@ -126,18 +126,20 @@ def create(name: str, /, **options: Any) -> Estimator:
 def _of_other_package(kind: type, options: Mapping[str, Any]) -> Estimator:
     """Return a configured estimator of a package that is not ours, if it has the interface.
 
-    The values that a plain dataclass is given are converted to its types, as pydantic's dataclass does by itself.
-
     Raises:
         Exception: anything.
     """
     with process_kept():
-        given = dict(options) if is_pydantic_dataclass(kind) else {
-            key: _fitting(kind, key, value) for key, value in options.items()
-        }  # fmt: skip
-        estimator = kind(**given)
+        estimator = kind(**_converted(kind, options))
         check_estimator(estimator)
         return estimator
+
+
+def _converted(kind: type, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options as the types of a plain dataclass want them; pydantic's dataclass converts by itself."""
+    if is_pydantic_dataclass(kind):
+        return dict(options)
+    return {key: _fitting(kind, key, value) for key, value in options.items()}
 
 
 def _fitting(kind: type, key: str, value: Any) -> Any:

@@ -188,17 +188,17 @@ def run_log(
         if not ours:
             voyage = _read_only(voyage)
         recorder = Recorder(sum(epoch.tick for epoch in voyage.epochs))
-        try:
-            if ending is None:
+        if ending is None:
+            try:
                 collector = NisCollector(estimator, log.rig) if nis else None
                 run = estimator.begin(log.prior, log.rig)
                 if not ours:
                     check_pass(run, estimator)
-        except BaseException as error:  # another package's code may raise anything
-            ending = Ending.by(error, voyage.start_ns)
-        if ending is None:
-            ending = _drive(run, voyage, recorder, limit_ns, collector)
-            smoothed, finish_ns, counts, ending = _finish(run, voyage, ending)
+            except BaseException as error:  # another package's code may raise anything
+                ending = Ending.by(error, voyage.start_ns)
+            else:
+                ending = _drive(run, voyage, recorder, limit_ns, collector)
+                smoothed, finish_ns, counts, ending = _finish(run, voyage, ending)
     online, ending = _checked(recorder.trajectory(), ending)
     if content is not None and content_sha256(log) != content:
         cause = f"{type(estimator).__name__} changed arrays of the log, the prior or the rig, which other runs use too"

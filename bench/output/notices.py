@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 from textwrap import shorten
-from typing import Any, NamedTuple
+from typing import Any
 
 from ...datasets.notes import KINDS
 from ..results.summary import Record, groups
@@ -44,7 +45,8 @@ LEAST_SHARE = 1e-3
 """Shown as a number: of less it is enough to know that it is little."""
 
 
-class Notice(NamedTuple):
+@dataclass(frozen=True)
+class Notice:
     """One kind of note on one log, over all its runs.
 
     Attributes:

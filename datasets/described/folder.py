@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -91,7 +91,7 @@ def write_folder(log: Log, folder: Path | str, fmt: Literal["parquet", "csv"] = 
     return folder
 
 
-def _write_new(folder: Path, files: Mapping[str, Callable[[Any], object]]) -> None:
+def _write_new(folder: Path, files: dict[str, Callable[[Any], object]]) -> None:
     """Write files that are not there yet: all, or none where one fails.
 
     Raises:

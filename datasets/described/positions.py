@@ -41,15 +41,16 @@ def position_rows(opening: Opening, stream: str, part: Any, others: tuple[d.Colu
 
     The rows have the values "latitude" and "longitude" (rad) if the position is global, and "height_m" if it has one.
     """
-    numbers = [] if part.position is None else list(part.position.columns)
+    position: d.Quantity | None = part.position
+    numbers = [] if position is None else list(position.columns)
     geodetic: d.Geodetic | None = part.geodetic
     if geodetic is not None and geodetic.altitude is not None:
         numbers += geodetic.altitude.columns
     rows = read_rows(opening, stream, part, [*numbers, *others], () if geodetic is None else geodetic.columns)
     if geodetic is not None:
         _locate(rows, geodetic)
-    elif part.on_the_globe:
-        _locate_ecef(rows, part.position)
+    elif position is not None and part.on_the_globe:
+        _locate_ecef(rows, position)
     return rows
 
 

@@ -250,7 +250,7 @@ def _use_valid(rows: Rows, valid: d.Valid) -> None:
         good = np.isin(values, valid.numbers)
     if len(good) and not good.any():
         found = ", ".join(dict.fromkeys(str(value)[:20] for value in values[:100].tolist()))
-        wanted = ", ".join(f"{value:g}" if isinstance(value, float) else value for value in valid.values)
+        wanted = ", ".join(value if isinstance(value, str) else f"{value:g}" for value in valid.values)
         text = f"{rows.stream}: no row is valid: column {column!r} holds {found}, never {wanted}"
         rows.opening.notes.append(Note(text, "silent", rows.stream, len(good), len(good)))
     rows.leave_out(~good, "invalid")
@@ -319,7 +319,7 @@ def _refuse_infinite(rows: Rows, columns: Sequence[d.Column]) -> None:
         return
     finite = np.isfinite(np.stack([rows.raw[column].astype(float) for column in columns], axis=1))
     rows.refuse(
-        ~finite.all(axis=1),
+        ~np.all(finite, axis=1),
         lambda row: _no_number(rows, columns[int(np.flatnonzero(~finite[row])[0])], row),
         "not finite",
     )

@@ -74,7 +74,7 @@ def unpacked(array: pa.Array[Any], *, as_written: bool) -> pd.Series | NDArray[A
         return _ns(ints, unit_ns).view("datetime64[ns]" if since_when else "timedelta64[ns]")
     if pa.types.is_dictionary(kind):
         used, place = np.unique(array.indices.fill_null(-1).to_numpy(zero_copy_only=False), return_inverse=True)
-        words = array.dictionary.take(pa.array(np.where(used < 0, None, used), pa.int64())).to_pylist()
+        words = array.dictionary.take(pa.array(used, pa.int64(), mask=used < 0)).to_pylist()
         return np.array([None if word is None else short(word) for word in words], object)[place]
     if as_written and pa.types.is_integer(kind) and array.null_count and not pa.types.is_uint64(kind):
         return _integers(array.cast(pa.int64()))

@@ -13,6 +13,7 @@ from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.finding import Finding
 from ..findings.fitting import Estimate
+from ..streams.channels import seconds
 from .relations import ROWS, Relation, likelihood
 from .sketch import Sketch
 
@@ -112,7 +113,7 @@ def most(*relations: Relation | None) -> float:
     for relation in relations:
         if relation is not None and relation.n >= 10:
             free = np.linalg.lstsq(relation.XX, relation.Xy, rcond=1e-9)[0]
-            total += likelihood(relation, free.reshape(3, 3))
+            total += likelihood(relation, np.asarray(free, np.float64).reshape(3, 3))
     return total
 
 
@@ -137,7 +138,7 @@ def agreement(sketch: Sketch, each: Hypothesis, v_B: Array | None = None) -> flo
     rate = np.einsum("ni,ni->n", sketch.up_I @ each.A.T, sketch.w_I @ each.G.T)
     score = _explained(f_B[heard, 1], (v_B[:, 0] * rate)[heard])
     if log.depth is not None and len(log.depth) >= 30:
-        z = sketch.on_grid((log.depth.t_ns - log.start_ns) * 1e-9, log.depth.z[:, 0])
+        z = sketch.on_grid(seconds(log, log.depth.t_ns), log.depth.z[:, 0])
         up = f_B / np.maximum(np.linalg.norm(f_B, axis=1, keepdims=True), 1e-9)
         score += _explained(np.gradient(z, sketch.t_s)[heard], np.einsum("ni,ni->n", up, v_B)[heard])
     return score

@@ -13,7 +13,7 @@ from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
 from ..findings.advice import clock_fix
 from ..findings.finding import Finding
-from ..findings.fitting import Plane
+from ..findings.fitting import Mask, Plane
 from ..streams.channels import seconds
 from .axes import CLEARLY, agreement, hypotheses
 from .shifts import LONGEST_S
@@ -146,7 +146,7 @@ def _solved(X: Plane, y: Plane) -> tuple[Plane, Array]:
     return z, np.abs(y - X @ z)
 
 
-def course_of(sketch: Sketch) -> tuple[Course, Array] | None:
+def course_of(sketch: Sketch) -> tuple[Course, Mask] | None:
     """Return the course, and where the DVL is heard (n,); None without a DVL."""
     motion, heading = sketch.velocity, sketch.heading
     if motion is None:
@@ -215,10 +215,10 @@ def heading_fits(sketch: Sketch, late_s: float) -> bool:
     )
 
 
-def _usable(course: Course, heard: Array, fixes: Fixes) -> bool:
+def _usable(course: Course, heard: Mask, fixes: Fixes) -> bool:
     """Whether positions reach far enough, and the DVL is heard between them."""
     between = (course.t_s >= fixes.t_s[0]) & (course.t_s <= fixes.t_s[-1])
-    heard_of = bool(between.any()) and np.mean(~heard[between]) <= SILENT_SHARE
+    heard_of = bool(between.any()) and float(np.mean(~heard[between])) <= SILENT_SHARE
     return heard_of and fixes.extent_m > max(EXTENT_M, 5 * fixes.sigma_m)
 
 
@@ -259,7 +259,7 @@ def _of_fixes(
 def _is_plain(match: Match, compass: bool) -> bool:
     """Whether the path need not be scaled, nor turned if it is by a compass."""
     straight = not compass or abs(np.angle(match.z)) < TURN_MATTERS
-    return straight and abs(abs(match.z) - 1) < SCALE_MATTERS
+    return bool(straight and abs(abs(match.z) - 1) < SCALE_MATTERS)
 
 
 def _other_coordinates(

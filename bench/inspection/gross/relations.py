@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ....datasets.state import Array
-from ..findings.fitting import Estimate
+from ..findings.fitting import Estimate, Mask
 from .sketch import Sketch
 
 TURN_S = 3.0
@@ -64,7 +64,7 @@ def tilting(sketch: Sketch) -> Relation:
     return Relation(flat.T @ flat, flat.T @ y.ravel(), float(np.sum(y * y)), len(y))
 
 
-def turning(sketch: Sketch, t_s: Array, psi: Array, heard: Array) -> Relation | None:
+def turning(sketch: Sketch, t_s: Array, psi: Array, heard: Mask) -> Relation | None:
     """Return how a yaw psi (m,) rad at t_s (m,) turns, by the gyro; None if they share too little."""
     lag = max(round(TURN_S / sketch.step_s), 1)
     steps = np.diff(sketch.turned_I, axis=0)

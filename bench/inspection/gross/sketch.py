@@ -9,7 +9,7 @@ import numpy as np
 
 from ....datasets.log import Log
 from ....datasets.state import Array
-from ..findings.fitting import Plane
+from ..findings.fitting import Mask, Plane
 from ..streams.channels import seconds
 
 FINEST_S = 0.5
@@ -69,14 +69,14 @@ class Sketch:
             return np.interp(self.t_s, t_s, values)
         return np.stack([np.interp(self.t_s, t_s, column) for column in values.T], axis=1)
 
-    def heard(self, t_s: Array) -> Array:
+    def heard(self, t_s: Array) -> Mask:
         """Return which cells (n,) lie between two readings at t_s (m,) that are no more than SILENT_S apart."""
         after = np.searchsorted(t_s, self.t_s).clip(1, len(t_s) - 1)
         apart = t_s[after] - t_s[after - 1]
         return (apart < max(SILENT_S, 3 * self.step_s)) & (self.t_s >= t_s[0]) & (self.t_s <= t_s[-1])
 
     @cached_property
-    def velocity(self) -> tuple[Array, Array] | None:
+    def velocity(self) -> tuple[Array, Mask] | None:
         """v_WB_B (n, 3) m/s by the DVL, unmeasured axes as zero, and where it is heard (n,); None without.
 
         Rows far faster than usual hold no reading. A DVL of which an axis never changes counts as absent.
@@ -94,7 +94,7 @@ class Sketch:
         return self.on_grid(t_s, dvl.z[good] * known), self.heard(t_s)
 
     @cached_property
-    def heading(self) -> tuple[Array, Array, Array] | None:
+    def heading(self) -> tuple[Array, Array, Mask] | None:
         """The heading sensor's times (m,) s, its angles (m,) rad, unwrapped, and where it is heard (n,)."""
         heading = self.log.heading
         if heading is None or len(heading) < 30:
@@ -103,7 +103,7 @@ class Sketch:
         return t_s, np.unwrap(heading.psi), self.heard(t_s)
 
     @cached_property
-    def truth_yaw(self) -> tuple[Array, Array, Array] | None:
+    def truth_yaw(self) -> tuple[Array, Array, Mask] | None:
         """When (m,) s, the yaw (m,) rad by the truth, and where it is known (n,); None without an attitude."""
         truth = self.log.truth
         if truth is None or len(truth) < 30:

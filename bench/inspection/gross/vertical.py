@@ -11,6 +11,7 @@ from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.advice import clock_fix
 from ..findings.finding import Finding
+from ..findings.fitting import Mask
 from ..streams.channels import seconds
 from .shifts import Shift, shift_of
 from .sketch import Sketch
@@ -39,7 +40,7 @@ class Slope(NamedTuple):
     shift: Shift
 
 
-def _heights(sketch: Sketch) -> dict[str, tuple[Array, Array]]:
+def _heights(sketch: Sketch) -> dict[str, tuple[Array, Mask]]:
     """Return the heights that there are on the grid (n,), m, and where each is heard (n,): dvl, depth, truth."""
     log, found = sketch.log, {}
     if log.depth is not None and len(log.depth) >= 30:
@@ -56,7 +57,7 @@ def _heights(sketch: Sketch) -> dict[str, tuple[Array, Array]]:
     return found
 
 
-def _slope(sketch: Sketch, one: tuple[Array, Array], other: tuple[Array, Array]) -> Slope | None:
+def _slope(sketch: Sketch, one: tuple[Array, Mask], other: tuple[Array, Mask]) -> Slope | None:
     """Return how `one` changes by `other`; None if they share too little, or hardly climb."""
     lag = max(round(STEP_S / sketch.step_s), 1)
     heard = one[1] & other[1]

@@ -98,7 +98,7 @@ def _times(log: Log) -> dict[str, TimeArray]:
 def _about_s(log: Log, name: str, interval_s: Array) -> Array:
     """Return the usual interval at each interval, (n,) s: the IMU's own about it, another sensor's median."""
     if name == "imu":
-        return np.asarray(log.imu.sampling_ns[1:] * 1e-9)
+        return np.asarray(log.imu.sampling_ns[1:] * 1e-9, np.float64)
     return np.full(len(interval_s), np.median(interval_s))
 
 
