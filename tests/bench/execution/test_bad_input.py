@@ -253,7 +253,9 @@ def spoilt(stream: str, at_s: float, value: float) -> Log:
     log = fresh()
     columns = {"gyro": log.imu.w_WI_I, "accel": log.imu.f_I} | {key: s.z for key, s in log.streams.items()}
     t_ns = log.streams[stream].t_ns if stream in SENSORS else log.imu.t_ns
+    columns[stream].setflags(write=True)
     columns[stream][np.searchsorted(t_ns, log.start_ns + int(at_s * SECOND))] = value
+    columns[stream].setflags(write=False)
     return log
 
 

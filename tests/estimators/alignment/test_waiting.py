@@ -58,7 +58,7 @@ def error_in_sigmas(log: Log, made: Initialisation) -> float:
 # --- gaps ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("samples", "early_s"), [(1, 5), (1, 60), (20, 60), (1, 1_700_000_000), (150, 3)])
+@pytest.mark.parametrize(("samples", "early_s"), [(1, 5), (1, 60), (20, 60), (1, 30_000_000), (150, 3)])
 def test_stale_first_stamps_are_left_out_and_told(log: Log, samples: int, early_s: int) -> None:
     n = len(log.imu.t_ns)
     early_ns = np.where(np.arange(n) < samples, early_s * SECOND, 0)
