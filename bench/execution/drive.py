@@ -206,7 +206,7 @@ def run_log(
 
     driven = voyage.epochs[: len(recorder.step_ns)]
     end_ns = driven[-1].t_ns if driven else voyage.start_ns
-    late = late_readings(log, estimator.factors, voyage.start_ns, end_ns)
+    late = late_readings(log, factors, voyage.start_ns, end_ns)
     counts = (
         {"readings": readings, "readings_late": late} | voyage.counts | (collector.counts if collector else {}) | counts
     )

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 from ...datasets.described.description import read_description
 from ...datasets.described.opening import find_log
 from ...datasets.log import Log
 from ..errors import ExperimentError
-from ..inspection.findings.advice import resolved
-from ..inspection.findings.finding import Finding
-from ..inspection.gross.gross import quick_findings
 
-Findings = Mapping[str, Sequence[Finding]]
+if TYPE_CHECKING:
+    from ..inspection.findings.finding import Finding
+
+Findings: TypeAlias = "Mapping[str, Sequence[Finding]]"
 """What looks wrong, by the name of the log."""
 
 
 def check_log(log: Log, name: str, data: Path | None = None) -> tuple[Finding, ...]:
     """Return what looks grossly wrong in a log that `open_log(name, data)` gave, with advice for its log.yaml."""
+    from ..inspection.findings.advice import resolved  # both load matplotlib, which tables do without
+    from ..inspection.gross.gross import quick_findings
+
     found = quick_findings(log)
     if not found:
         return ()

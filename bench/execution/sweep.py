@@ -21,7 +21,6 @@ from ...datasets.described.opening import RecordingNotFound
 from ..errors import ExperimentError, StoppedError
 from ..experiment.plan import Experiment, Run
 from ..files import writing
-from ..inspection.findings.finding import Finding
 from ..results.identity import FINAL, content_sha256
 from ..results.store import Row, Store, provenance, sole_writer, with_whole_specs
 from .cold_start import compile_first
@@ -275,7 +274,7 @@ def _opened(tasks: Sequence[Task], check: bool) -> tuple[list[Task], list[dict[s
     Returns the tasks whose log is here, a row for each of the others, how long each log is (s), and what the check of
     each recorded log found.
     """
-    findings: dict[str, Sequence[Finding]] = {}
+    findings: dict[str, Any] = {}
     duration_s: dict[str, float] = {}
     readings: dict[str, str] = {}
     missing: dict[str, str] = {}

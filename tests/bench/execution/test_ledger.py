@@ -398,7 +398,7 @@ def test_a_message_that_is_no_text_is_one_bad_row(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(runner, "run_all", here)
     rows = run_experiment(experiment(seeds=[1, 2]), out=tmp_path)
     assert rows["status"].tolist() == ["failed", "done"]
-    assert rows["cause"][0] == "bad file name \\udcff\x00"
+    assert rows["cause"][0] == "bad file name \\udcff\\x00"
     assert rows["peak_mb"][0] == 1.5
 
 

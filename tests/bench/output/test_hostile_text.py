@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import json
+import re
+from base64 import b64decode
 from pathlib import Path
 
 import pandas as pd
@@ -23,7 +26,12 @@ SHOWN = r"=cmd|' /C calc'!A0 \x1b[2J\x9b31m\u202egnp\x07\x00"
 
 def store() -> pd.DataFrame:
     names = {"experiment": "e", "log": HOSTILE, "label": HOSTILE, "seed": 1, "output": "online", "status": "failed"}
-    origin = {"cause": HOSTILE, "spec": json.dumps({"log": HOSTILE}), "notes": json.dumps([HOSTILE]), "commit_id": "x"}
+    origin = {
+        "cause": HOSTILE,
+        "spec": json.dumps({"log": HOSTILE}),
+        "notes": json.dumps([{"kind": "about", "text": HOSTILE}]),
+        "commit_id": "x",
+    }
     row = dict.fromkeys(COLUMNS) | names | origin | {"align": "none", "dims": "3d", "estimator": HOSTILE}
     numbers = [name for name, kind in COLUMNS.items() if kind == "REAL"]
     return pd.DataFrame([row]).astype(dict.fromkeys(numbers, "float64") | {"seed": "Int64"})
@@ -42,9 +50,13 @@ def test_a_table_on_the_terminal_shows_codes(capsys: pytest.CaptureFixture[str])
 
 def test_a_page_shows_codes(tmp_path: Path) -> None:
     page = render(store(), tmp_path, [])
-    assert is_plain(page[: page.index("<style>")] + page[page.index("</style>") : page.index("plotly.js")])
+    assert is_plain(page[: page.index("<style>")] + page[page.index("</style>") :])
     assert r"\x1b[2J\x9b31m\u202egnp" in page  # in a table
-    assert r"\\x1b[2J\\x9b31m\\u202egnp" in page  # in the details that the script opens
+    packed = re.findall(r'<script type="application/gzip"[^>]*>([^<]+)</script>', page)
+    texts = [gzip.decompress(b64decode(text)).decode() for text in packed]
+    details = [text for text in texts if text.startswith(("{", "["))]  # what is opened by a script, and no script
+    assert all(is_plain(text) for text in details)
+    assert any(r"\\x1b[2J\\x9b31m\\u202egnp" in text for text in details)
 
 
 def test_latex_shows_codes() -> None:
