@@ -60,7 +60,7 @@ def test_all_logs_go_through_one_experiment_and_a_format_changes_no_score(
 ) -> None:
     for name, write in (EXACT | NEARLY).items():
         write(log, tmp_path / name)
-    estimators = [{"name": "eskf"}, {"name": "fls", "with": {"lag_s": 3.0}}]
+    estimators = [{"name": "eskf"}, {"name": "window", "with": {"lag_s": 3.0}}]
     written = [{"log": str(tmp_path / name), "name": name} for name in EXACT | NEARLY]
     recorded = [{"log": name, "align": "yaw", "dims": "2d"} for name in catalog_names()]
     plan = {"logs": written + recorded, "estimators": estimators}
@@ -70,7 +70,7 @@ def test_all_logs_go_through_one_experiment_and_a_format_changes_no_score(
     assert result.exit_code == 0, result.output[-2000:]
     rows = load_runs(tmp_path / "out" / "formats")
     assert set(rows["status"]) == {"done"}
-    assert len(rows) == 3 * (len(written) + len(recorded))  # two estimators online, and fls smoothed
+    assert len(rows) == 3 * (len(written) + len(recorded))  # two estimators online, and window smoothed
     ate = rows.pivot_table(index="log", columns=["label", "output"], values="ate_rmse_m")
     assert len(recorded) >= 4
     ours = ate.loc["parquet"]
