@@ -12,6 +12,7 @@ from itertools import cycle
 from pathlib import Path
 from textwrap import fill, wrap
 from typing import NamedTuple
+from warnings import catch_warnings, filterwarnings
 
 from matplotlib import rc_context
 from matplotlib.artist import Artist
@@ -138,7 +139,8 @@ def save(figure: Figure, stem: Path) -> list[Path]:
     """Write a figure as PDF, with its fonts as TrueType, and as PNG, and return the files."""
     stem.parent.mkdir(parents=True, exist_ok=True)
     files = [Path(f"{stem}.pdf"), Path(f"{stem}.png")]
-    with rc_context({"pdf.fonttype": 42}):
+    with rc_context({"pdf.fonttype": 42}), catch_warnings():
+        filterwarnings("ignore", "Glyph .* missing from", UserWarning)  # a name in letters that the font has not
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # computed once, for both files
         for file in files:
