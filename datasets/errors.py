@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union, get_args, get_origin
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -88,7 +88,7 @@ def complaints(
     # where no item of a list fits, pydantic also says that the list is empty
     every = [problem for problem in every if not (problem["type"] == "too_short" and problem["input"])]
     every.sort(key=lambda problem: problem["type"] not in UNKNOWN_KEY)
-    told = list(dict.fromkeys(_complaint(problem, model, above, renamed or {}) for problem in every[:MOST_COMPLAINTS]))
+    told = _together([_complaint(problem, model, above, renamed or {}) for problem in every[:MOST_COMPLAINTS]])
     return told if len(every) <= MOST_COMPLAINTS else [*told, f"and {len(every) - MOST_COMPLAINTS} more of this kind"]
 
 
@@ -96,20 +96,45 @@ UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 """Pydantic's types of error for an unknown key, in a model and in a dataclass."""
 
 
-def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[str, str]) -> str:
+class _Complaint(NamedTuple):
+    """What is wrong at a place; or what was expected there instead of what was found, by a member of a union or all."""
+
+    place: str
+    what: str
+    found: str = ""
+    hint: str = ""
+
+
+def _together(every: list[_Complaint]) -> list[str]:
+    """Return sentences, one for each place and value: the members of a union expect different things of one value."""
+    told: dict[tuple[str, str], list[_Complaint]] = {}
+    for each in every:
+        within = any(other.place.startswith((f"{each.place}[", f"{each.place}.")) for other in every)
+        if not (each.found and each.place and within):  # else a member of the union looks further in
+            told.setdefault((each.place, each.found or each.what), []).append(each)
+    sentences = []
+    for (place, _), same in told.items():
+        what = " or ".join(dict.fromkeys(each.what for each in same))
+        found, hint = same[0].found, next((each.hint for each in same if each.hint), "")
+        text = f"expected {what}, found {found}{hint}" if found else what
+        sentences.append(f"`{place}`: {text}" if place else text)
+    return sentences
+
+
+def _complaint(problem: Any, model: Any, above: Sequence[str], renamed: Mapping[str, str]) -> _Complaint:
     steps, known, inner = _followed(problem["loc"], model)
     place = "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in (*above, *steps)).lstrip(".")
     if problem["type"] in UNKNOWN_KEY:
         key = str(problem["loc"][-1])
         if re.split("[.,]", renamed.get(key, ""))[0] in known:  # a key that is new at this place
-            return f"`{place}` is called `{renamed[key]}` now"
-        return f"unknown key `{place}`{nearest(key, known)} (known: {', '.join(known)})"
+            return _Complaint("", f"`{place}` is called `{renamed[key]}` now")
+        return _Complaint("", f"unknown key `{place}`{nearest(key, known)} (known: {', '.join(known)})")
     if problem["type"] in ("missing", "missing_argument"):
-        return f"missing key `{place}`"
-    what = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] != "value_error":
-        what = _expected(problem, inner) + f", found {repr(problem['input'])[:LONGEST_VALUE]}"
-    return f"`{place}`: {what}" if place else what
+        return _Complaint("", f"missing key `{place}`")
+    if problem["type"] == "value_error":
+        return _Complaint(place, problem["msg"].removeprefix("Value error, "))
+    what, hint = _expected(problem, inner)
+    return _Complaint(place, what, repr(problem["input"])[:LONGEST_VALUE], hint)
 
 
 NO_KEYS = ("dict_type", "mapping_type", "dataclass_type", "model_type", "model_attributes_type")
@@ -134,16 +159,17 @@ EXPECTED = {
 """What was expected, by pydantic's type of error; the braces are of its context."""
 
 
-def _expected(problem: Any, known: Sequence[str]) -> str:
-    """Return what was expected, in a file's words instead of Python's; `known` are the keys that the value may have."""
+def _expected(problem: Any, known: Sequence[str]) -> tuple[str, str]:
+    """Return what was expected, in a file's words instead of Python's, and a hint; `known`: keys the value may have."""
     if problem["type"] in NO_KEYS:
         key = next((key for key in NAMING if key in known), None)
         keys = f" ({', '.join(known)})" if known else ""
         hint = f"; write {{{key}: {problem['input']}}}" if key and isinstance(problem["input"], str) else ""
-        return f"expected keys and values{keys}{hint}"
+        return f"keys and values{keys}", hint
     if problem["type"] in EXPECTED:
-        return f"expected {EXPECTED[problem['type']].format(**problem.get('ctx', {}))}"
-    return str(problem["msg"]).replace("Input should be", "expected")
+        what, value = EXPECTED[problem["type"]].format(**problem.get("ctx", {})), problem["input"]
+        return what, nearest(value, re.findall(r"'([^']*)'", what)) if isinstance(value, str) else ""
+    return str(problem["msg"]).removeprefix("Input should be ").removeprefix("expected "), ""
 
 
 def _followed(loc: Sequence[str | int], model: Any) -> tuple[list[str | int], list[str], list[str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from decimal import Decimal
+from decimal import ROUND_HALF_EVEN, Context, Decimal, DivisionByZero, InvalidOperation, Overflow
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,9 @@ from .state import LIMIT_NS, TimeArray
 
 NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Nanoseconds per unit."""
+UNIT_NAMES = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+CONTEXT = Context(28, ROUND_HALF_EVEN, -999_999, 999_999, 1, 0, [], [InvalidOperation, DivisionByZero, Overflow])
+"""Of decimal's arithmetic, as Python starts with: that of the process is anybody's to change. Times have 19 digits."""
 DAY_NS = 86_400 * 1_000_000_000
 """Nanoseconds per day."""
 FAR_NS = 400 * DAY_NS
@@ -61,11 +64,11 @@ def times_ns(values: NDArray[Any], unit: str) -> tuple[TimeArray, NDArray[np.boo
     words: list[int] = []
     for row, text in enumerate(values):
         try:
-            value = Decimal(text.strip()) * factor if isinstance(text, str) else NO_TIME
+            value = _scaled(text.strip(), factor) if isinstance(text, str) else NO_TIME
         except ArithmeticError:
             words.append(row)
             continue
-        if value.is_finite() and abs(value) < LIMIT_NS:
+        if value.is_finite() and -LIMIT_NS < value < LIMIT_NS:
             ns[row], good[row] = round(value), True
     if words:
         ns[words], good[words] = _written_dates_ns([values[row].strip() for row in words])
@@ -101,9 +104,26 @@ def seconds_to_ns(text: str) -> int:
         ValueError: not a number, or one beyond LIMIT_NS.
     """
     try:
-        ns = (Decimal(text) * 1_000_000_000).to_integral_value()
-        if abs(ns) < LIMIT_NS:
+        ns = CONTEXT.to_integral_value(_scaled(text, NS_PER["s"]))
+        if -LIMIT_NS < ns < LIMIT_NS:
             return int(ns)
     except ArithmeticError:  # decimal's errors are of this kind
         pass
-    raise ValueError(f"not a time in seconds: {text[:40]!r}; nanoseconds?")
+    meant = finer_unit(text, "s")
+    hint = f"; this looks like {UNIT_NAMES[meant]}" if meant else ""
+    raise ValueError(f"not a time in seconds: {text[:40]!r}{hint}")
+
+
+def finer_unit(stamp: Any, unit: str) -> str:
+    """Return the unit that a stamp beyond the clock is probably in: the coarsest in which it is a time; "" if none."""
+    try:
+        value = float(stamp)
+    except (TypeError, ValueError):
+        return ""
+    if not abs(value) * NS_PER[unit] >= LIMIT_NS:
+        return ""
+    return next((finer for finer, factor in NS_PER.items() if abs(value) * factor < LIMIT_NS), "")
+
+
+def _scaled(text: str, factor: int) -> Decimal:
+    return CONTEXT.multiply(CONTEXT.create_decimal(text), Decimal(factor))

@@ -10,19 +10,20 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
+from decimal import localcontext
 
 import numpy as np
 
 
 @contextmanager
 def process_kept() -> Iterator[None]:
-    """Undo on leaving: folder, environment, signal handlers, locale, recursion limit, warnings, NumPy's errors.
+    """Undo on leaving: folder, environment, signal handlers, locale, recursion limit, warnings, NumPy, decimal.
 
     What the code prints goes to standard error, since standard output is for results.
     """
     folder, environment, deepest = _folder(), dict(os.environ), sys.getrecursionlimit()
     language, handlers = locale.setlocale(locale.LC_ALL), _handlers()
-    with warnings.catch_warnings(), np.errstate(), redirect_stdout(sys.stderr):
+    with warnings.catch_warnings(), np.errstate(), localcontext(), redirect_stdout(sys.stderr):
         try:
             yield
         finally:

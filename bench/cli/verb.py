@@ -1,10 +1,12 @@
-"""Exit of every verb: bad input is one line on standard error and status 2; Ctrl-C is status 130."""
+"""Exit of every verb: bad input is a line per complaint on standard error and status 2; Ctrl-C is status 130."""
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from textwrap import wrap
 from typing import Any
 
 import typer
@@ -13,9 +15,12 @@ from typer.core import TyperCommand
 SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit statuses; 130 is what shells report for a command that Ctrl-C ended (128 + SIGINT)."""
 
+BETWEEN_WORDS: Any = {"break_long_words": False, "break_on_hyphens": False}
+"""Paths and values stay whole, to be copied."""
+
 
 class Verb(TyperCommand):
-    """A command that reports what a user can correct in one line. Bugs of ours keep their traceback."""
+    """A command that reports what a user can correct, a line for each complaint. Bugs of ours keep their traceback."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line; an invalid choice is reported without pydantic's prefix."""
@@ -42,7 +47,7 @@ class Verb(TyperCommand):
 
             if not isinstance(error, FathomError):
                 raise
-            refuse(" ".join(str(error).split()), SOME_FAILED if isinstance(error, StoppedError) else BAD_INPUT)
+            refuse(str(error), SOME_FAILED if isinstance(error, StoppedError) else BAD_INPUT)
 
 
 @contextmanager
@@ -62,7 +67,10 @@ def refuse(message: str, status: int = BAD_INPUT) -> None:
 
 
 def say(message: str) -> None:
-    """Print on standard error."""
+    """Print on standard error; on a terminal, lines are folded between words, and indented where they go on."""
     from ...datasets.errors import shown
 
-    print(shown(message), file=sys.stderr)
+    width = shutil.get_terminal_size().columns if sys.stderr.isatty() else sys.maxsize
+    for line in message.splitlines():
+        text = shown(" ".join(line.split()))
+        print("\n".join(wrap(text, width, subsequent_indent="  ", **BETWEEN_WORDS)), file=sys.stderr)

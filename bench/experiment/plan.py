@@ -83,7 +83,7 @@ class Experiment(Settings):
                 estimators=tuple(each for entry in asked.estimators for each in entry.variants()),
             )
         except ValidationError as error:
-            raise ExperimentError(f"{source}: {'; '.join(complaints(error, ExperimentFile))}") from None
+            raise ExperimentError(*(f"{source}: {each}" for each in complaints(error, ExperimentFile))) from None
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Experiment:
@@ -96,7 +96,7 @@ class Experiment(Settings):
         try:
             content = read_yaml(path)
         except DatasetError as error:
-            raise ExperimentError(str(error)) from None
+            raise ExperimentError(*error.args) from None
         if not isinstance(content, dict):
             raise ExperimentError(f"{path}: expected keys such as `name`, `logs`, `estimators`, found {content!r:.60}")
         return cls.from_dict({"name": path.stem} | content, str(path))

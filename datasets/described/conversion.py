@@ -74,6 +74,8 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
         for part, rows in ((streams.gps, gps_rows), (truth_part, truth_rows)):
             if origin is None and part is not None and part.on_the_globe and rows is not None:
                 origin = first_fix(part, rows, int(imu.t_ns[0]))
+    if description.origin is None and streams.gps is not None and streams.gps.on_the_globe and truth_part is not None:
+        opening.notes += _origin_unsaid(truth_part)
     gps = None if gps_rows is None or streams.gps is None else _gps(streams.gps, gps_rows, origin)
     heading = None if streams.heading is None else _heading(opening, streams.heading, origin)
     truth = None
@@ -119,6 +121,17 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     with _named(folder):
         _check_clocks(log)
     return log
+
+
+def _origin_unsaid(truth: d.TruthDescription) -> list[Note]:
+    """Return that W begins at the first fix of the GPS, while the truth has an origin of its own."""
+    if truth.on_the_globe:
+        return []
+    text = (
+        "W begins at the first fix of the GPS, with its error, while the truth is in local axes whose origin is "
+        "not said; state `origin`, the place of the truth's zero"
+    )
+    return [Note(text, "check", "truth")]
 
 
 def _check_clocks(log: Log) -> None:

@@ -514,6 +514,10 @@ class Streams(Part):
     heading: HeadingDescription | None = None
 
 
+BESIDE_POSES = {"kind", "tum", "trajectory", "lookahead_s", "from_s", "until_s"}
+"""The keys of a truth that have a meaning beside a file of poses."""
+
+
 class TruthDescription(Placed, Window):
     """The true trajectory: a TUM file, a table of ours (`trajectory`), or a stream like the others."""
 
@@ -540,7 +544,15 @@ class TruthDescription(Placed, Window):
         sources = [n for n in ("tum", "trajectory", "table", "message") if getattr(self, n) is not None]
         if len(sources) != 1:
             raise ValueError("give one of `tum`, `trajectory`, `table` and `message`")
-        if sources[0] in ("table", "message"):
+        if sources[0] in ("tum", "trajectory"):
+            idle = [name for name in type(self).model_fields if name in self.model_fields_set - BESIDE_POSES]
+            if idle:
+                named = ", ".join(f"`{name}`" for name in idle)
+                raise ValueError(
+                    f"{named}: no effect beside `{sources[0]}`, whose poses are those of B in W, in our units; "
+                    "leave it out, or describe the file as a `table`"
+                )
+        else:
             if self.time is None or (self.geodetic is None and self.position is None):
                 raise ValueError("a truth from a stream needs `time`, and `geodetic` or `position`")
             if self.position is None and self.geodetic and self.geodetic.altitude is None and self.height_m is None:

@@ -20,6 +20,8 @@ FAR_M = 100e3
 reports (0, 0, 0)."""
 NEAR_RAD = np.radians(1.0)
 """Within 1° of latitude and longitude 0, a place of exactly 0, 0 may be one, and is none reported without a fix."""
+HEMISPHERES = {"NS": ("N", "S", "NORTH", "SOUTH"), "EW": ("E", "W", "EAST", "WEST")}
+"""What a column of hemispheres may hold, in letters of either case."""
 GUESSES = (("degE7", 1_800_000.0), ("ddmmss", 18_000.0), ("ddmm", 90.0))
 """The unit in which a latitude above this probably is: 180° are 18,000 in ddmm, and 1,800,000 in ddmmss."""
 
@@ -55,6 +57,8 @@ def position_rows(opening: Opening, stream: str, part: Any, others: tuple[d.Colu
 
 
 def _locate(rows: Rows, part: d.Geodetic) -> None:
+    _refuse_no_hemisphere(rows, part.north_south, "NS")
+    _refuse_no_hemisphere(rows, part.east_west, "EW")
     scales = np.broadcast_to(part.scale, (2,))
     latitude = _angle(rows, part.latitude, part.unit, float(scales[0]), "NS", part.north_south)
     longitude = _angle(rows, part.longitude, part.unit, float(scales[1]), "EW", part.east_west)
@@ -77,6 +81,21 @@ def _locate(rows: Rows, part: d.Geodetic) -> None:
     if part.altitude is not None:
         rows.values["height_m"] = rows.si(part.altitude)[:, 0]
     rows.refuse(~there | nowhere, found, "at no place on earth")
+
+
+def _refuse_no_hemisphere(rows: Rows, column: d.Column | None, signs: str) -> None:
+    if column is None:
+        return
+    known = [isinstance(text, str) and text.strip().upper() in HEMISPHERES[signs] for text in rows.raw[column]]
+    rows.refuse(
+        ~np.array(known, bool),
+        lambda row: f"no hemisphere: column {column!r} is {_held(rows.raw[column][row])}, not {signs[0]} or {signs[1]}",
+        "without a hemisphere",
+    )
+
+
+def _held(value: Any) -> str:
+    return repr(str(value))[:40] if isinstance(value, str) else "empty" if np.isnan(value) else str(value)
 
 
 def _away_from_zero(latitude: Array, longitude: Array, rows: NDArray[np.bool_]) -> bool:

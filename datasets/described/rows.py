@@ -15,7 +15,7 @@ from ..formats.table import Columns, Flaws
 from ..log import is_noise
 from ..notes import Note
 from ..state import LIMIT_NS, Array, TimeArray
-from ..times import far, far_complaint, times_ns
+from ..times import UNIT_NAMES, far, far_complaint, finer_unit, times_ns
 from . import description as d
 from .order import complaint, disorder, laps, unwrapped
 from .sources import Opening
@@ -183,6 +183,7 @@ def read_rows(
     rows = _timed(opening, stream, time, raw, flaws)
     if valid is not None:
         _use_valid(rows, valid)
+    _refuse_other_unit(rows, time, stamps)
     rows.refuse(
         ~rows.timed,
         lambda row: f"time is {_shown([rows.raw[column][row] for column in stamps])}",
@@ -219,6 +220,9 @@ def _timed(opening: Opening, stream: str, time: d.Time, raw: Columns, flaws: Fla
     rows.total = count
     if flaws.other_lines:
         opening.notes.append(f"{stream}: {flaws.other_lines} lines of other kinds left out")
+    if flaws.cut_off:
+        text = f"{stream}: the last line is cut off, and left out; it ends in {flaws.cut_off!r}"
+        opening.notes.append(Note(text, "damage", stream, 1, count + 1))
     if flaws.too_long:
         rows.total += flaws.too_long
         rows.bad(flaws.too_long, "lines have more fields than the first", "with too many fields")
@@ -254,6 +258,24 @@ def _use_valid(rows: Rows, valid: d.Valid) -> None:
         text = f"{rows.stream}: no row is valid: column {column!r} holds {found}, never {wanted}"
         rows.opening.notes.append(Note(text, "silent", rows.stream, len(good), len(good)))
     rows.leave_out(~good, "invalid")
+
+
+def _refuse_other_unit(rows: Rows, time: d.Time, stamps: Sequence[d.Column]) -> None:
+    """Refuse a column of times that are mostly too large for their unit, and not for a finer one.
+
+    Raises:
+        DatasetError: names the unit that is probably meant.
+    """
+    if np.count_nonzero(~rows.timed) <= LARGEST_SHARE * len(rows.timed):
+        return
+    row = int(np.flatnonzero(~rows.timed)[0])
+    for at, column in enumerate(stamps):
+        unit, stamp = time.units[at % len(time.units)], rows.raw[column][row]
+        if meant := finer_unit(stamp, unit):
+            raise rows.error(
+                f"row {rows.number[row]}: column {column!r} is {stamp}, with `unit: {unit}`; "
+                f"this looks like {UNIT_NAMES[meant]}: `unit: {meant}`"
+            )
 
 
 def _shown(stamps: Sequence[Any]) -> str:

@@ -71,11 +71,13 @@ class Flaws:
     Attributes:
         words: by column, the fields that are not numbers, by their row (the first 1000 of a column); they read as NaN.
         other_lines: lines of other kinds, which `Table.lines` leaves out.
+        cut_off: the end of a last line that is cut off, and left out; "" where there is none.
         too_long: lines with more fields than the first one, left out; None: they are an error.
     """
 
     words: dict[Column, dict[int, str]] = field(default_factory=dict)
     other_lines: int = 0
+    cut_off: str = ""
     too_long: int | None = None
 
 

@@ -26,6 +26,13 @@ PIECE_ROWS = 1 << 14
 """Rows at a time, about as much."""
 WIDE = 500
 """Of a table with more columns only the wanted ones are handed to pandas, which takes its time for every column."""
+BEFORE, FEWEST_BEFORE = 100, 10
+"""Lines before the last one with which it is compared, and how many it needs: a number of fewer decimals than all of a
+hundred others is hardly one in full."""
+LONGEST_END = 40
+"""Characters of a line that is cut off, of which a note shows the end."""
+LONG_WHOLE = 5
+"""Characters from which on whole numbers are compared by their length; shorter ones lose a digit by counting down."""
 SEPARATOR = "\x1f"
 """Put in the place of a delimiter of several letters; ASCII made it to separate fields, and texts do not hold it."""
 
@@ -36,6 +43,7 @@ class _Lines(io.TextIOBase):
     def __init__(self, file: IO[str], table: Table, flaws: Flaws) -> None:
         self.file, self.table, self.flaws, self.ahead = file, table, flaws, ""
         self.separator, self.rows = separator_of(table), 0
+        self.before = list[str]()
         self.picked, self.width = list[int](), 0
         self.comment = table.comment
         self.kinds = () if table.lines is None else table.lines.values  # noqa: PD011  (our own field)
@@ -50,8 +58,25 @@ class _Lines(io.TextIOBase):
         if self.kinds:
             rows, every = [row for row in rows if self._kind(row) in self.kinds], len(rows)
             self.flaws.other_lines += every - len(rows)
+        before, self.before = self.before, (self.before + rows)[-BEFORE:]
+        if rows and not rows[-1].endswith("\n") and self._cut_off(rows[-1], (before + rows[:-1])[-BEFORE:]):
+            self.flaws.cut_off = rows.pop()[-LONGEST_END:]
         self.rows += len(rows)
         return rows
+
+    def _cut_off(self, last: str, before: list[str]) -> bool:
+        """Return whether a last line without an end has fewer fields than those before it, or a shorter last number."""
+        if len(before) < FEWEST_BEFORE:
+            return False
+        fields, others = self.fields(self._separated(last)), [self.fields(self._separated(line)) for line in before]
+        if len(fields) < min(map(len, others)):
+            return True
+        at = len(fields) - 1
+        texts = [other[at] for other in others if len(other) > at]
+        decimals = [_decimals(text, self.table.decimal) for text in texts]
+        if any(decimals):
+            return _decimals(fields[at], self.table.decimal) < min(decimals)
+        return LONG_WHOLE <= min(map(len, texts)) > len(fields[at]) and all(map(_is_whole, texts))
 
     def _kind(self, line: str) -> str | None:
         fields = line.split(None if self.separator == r"\s+" else self.table.delimiter, self.kind_field + 1)
@@ -97,6 +122,14 @@ class _Lines(io.TextIOBase):
             elif line and self.flaws.too_long is None:
                 raise ValueError(f"a line has {len(fields)} fields instead of {self.width}")
         return "".join(kept)
+
+
+def _decimals(text: str, mark: str) -> int:
+    return len(text.strip().partition(mark)[2])
+
+
+def _is_whole(text: str) -> bool:
+    return text.strip().removeprefix("-").isdecimal()
 
 
 def separator_of(table: Table) -> str:

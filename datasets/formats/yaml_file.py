@@ -30,6 +30,10 @@ MOST_LEVELS = 50
 """Lists and mappings in one another; our deepest file has 9."""
 LONGEST_NUMBER = 100
 """Characters. 64 bits need 20, a float 24; more is a mistake, and slow to read."""
+LEADING_ZERO = re.compile(r"[-+]?0[0-9_]+")
+"""YAML 1.1 takes 045 for octal, 37, and 087 for text."""
+SIXTIETHS = re.compile(r"[-+]?[0-9][0-9_]*(:[0-5]?[0-9])+(\.[0-9_]*)?")
+"""YAML 1.1 takes 1:30 for 90."""
 _PLAIN = {f"tag:yaml.org,2002:{kind}" for kind in ("seq", "map")}
 _NUMBERS = {f"tag:yaml.org,2002:{kind}" for kind in ("int", "float")}
 _MERGE = "tag:yaml.org,2002:merge"
@@ -148,6 +152,8 @@ class _Builder(_Loader):
             return event.value
         if tag in _NUMBERS and len(event.value) > LONGEST_NUMBER:
             raise self._refused(event, f"a number of more than {LONGEST_NUMBER} characters; put text in quotes")
+        if event.implicit[0] or tag in _NUMBERS:
+            self._refuse_other_bases(event, tag)
         construct = self.yaml_constructors.get(tag)
         if construct is None or tag in _PLAIN:
             raise self._refused(event, f"the tag {tag[:60]} is not known here; leave it out")
@@ -156,6 +162,18 @@ class _Builder(_Loader):
         except (ValueError, TypeError, AttributeError, LookupError) as error:
             what = f"{shown(event.value)[:60]!r} cannot be read as {tag.rpartition(':')[2]}: {error}"
             raise self._refused(event, f"{what}; put text in quotes") from None
+
+    def _refuse_other_bases(self, event: Any, tag: str) -> None:
+        """Refuse a plain number that means something else in YAML 1.1 than to its writer."""
+        text = event.value
+        if LEADING_ZERO.fullmatch(text[:LONGEST_NUMBER]):
+            plain = text.replace("_", "").lstrip("+-0") or "0"
+            meant = f"-{plain}" if text.startswith("-") and plain != "0" else plain
+            what = f"{text[:60]} is a number with a leading zero, which YAML may read as octal"
+            raise self._refused(event, f"{what}; write {meant[:60]}, or put text in quotes")
+        if tag in _NUMBERS and SIXTIETHS.fullmatch(text):
+            what = f"{text[:60]} is a number in base 60 to YAML (1:30 is 90)"
+            raise self._refused(event, f"{what}; write a decimal number, or put text in quotes")
 
     def _list(self, level: int) -> list[Any]:
         found = []

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any, Literal
 
 import pytest
 from fathom.bench.errors import ExperimentError
 from fathom.bench.metrics import ScoreError
-from fathom.datasets.errors import DatasetError, FathomError, one_line, shown
+from fathom.datasets.errors import DatasetError, FathomError, complaints, one_line, shown
 from fathom.estimators.registry import EstimatorError
+from pydantic import BaseModel, ValidationError
 
 
 @pytest.mark.parametrize(
@@ -43,3 +45,22 @@ def test_lines_of_an_error_stay_lines_by_way_of_a_worker() -> None:
 
 def test_an_exception_of_other_code_is_one_line_that_can_be_printed() -> None:
     assert one_line(RuntimeError("\x1b[2J\nworse")) == r"RuntimeError: \x1b[2J worse"
+
+
+class _Time(BaseModel):
+    unit: Literal["s", "ms", "us"] | tuple[Literal["s", "ms", "us"], Literal["s", "ms", "us"]] = "s"
+    column: int | str = 0
+
+
+@pytest.mark.parametrize(
+    ("raw", "says"),
+    [
+        ({"unit": "mss"}, ["`unit`: expected 's', 'ms' or 'us' or a list, found 'mss'; did you mean 'ms'?"]),
+        ({"unit": ["s", "uss"]}, ["`unit[1]`: expected 's', 'ms' or 'us', found 'uss'; did you mean 'us'?"]),
+        ({"column": 1.5}, ["`column`: expected a whole number or text, found 1.5"]),
+    ],
+)
+def test_one_value_has_one_complaint_whatever_the_members_of_a_union_say(raw: dict[str, Any], says: list[str]) -> None:
+    with pytest.raises(ValidationError) as error:
+        _Time.model_validate(raw)
+    assert complaints(error.value, _Time) == says

@@ -657,7 +657,8 @@ def test_repeated_rows_are_repaired_however_many_they_are(folder):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1403636579763555584 0 0 0 0 0 0 1", "line 1: not a time in seconds: '1403636579763555584'; nanoseconds?"),
+        ("1403636579763555584 0 0 0 0 0 0 1", "line 1: not a time in seconds: '1403636579763555584'; this looks like"),
+        ("1732960000000 0 0 0 0 0 0 1", "line 1: not a time in seconds: '1732960000000'; this looks like milliseconds"),
         ("1e999999999 0 0 0 0 0 0 1", "line 1: not a time in seconds: '1e999999999'"),
         ("nan 0 0 0 0 0 0 1", "line 1: not a time in seconds: 'nan'"),
         ("soon 0 0 0 0 0 0 1", "line 1: not numbers: 'soon"),

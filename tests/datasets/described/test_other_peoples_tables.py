@@ -378,3 +378,103 @@ def test_no_message_speaks_of_numpy(folder):
     with pytest.raises(DatasetError, match=r"no column 9; found 0, 1, 2, 3"):
         dvl(folder, "\n".join(ROWS), table={"file": "dvl.csv", "header": False},
             time={"column": 0}, velocity={"columns": [1, 2, 9], "unit": "m/s"})  # fmt: skip
+
+
+# -- a last line that is cut off
+
+
+def cut(folder: Path, rows: list[str], last: str) -> tuple[int, list[str]]:
+    stream, notes = dvl(folder, "\n".join(["t,vx,vy,vz", *rows, last]))
+    return len(stream), [str(note) for note in notes if getattr(note, "kind", "") == "damage"]
+
+
+FIXED = [f"{START + i // 4}.{i % 4 * 25},0.1250,0.2500,-8.7{i:03d}" for i in range(1, 13)]
+
+
+@pytest.mark.parametrize("end", ["-8.", "-8", "-8.706", ""])
+def test_a_last_number_that_is_cut_off_costs_its_row_and_is_told(folder: Path, end: str) -> None:
+    rows, notes = cut(folder, FIXED, f"{START + 4},0.1250,0.2500,{end}")
+    assert rows == 12
+    assert [note[:45] for note in notes] == ["dvl: the last line is cut off, and left out; "]
+
+
+def test_a_last_line_of_too_few_fields_is_cut_off_where_the_last_column_is_not_asked_for(folder: Path) -> None:
+    stream, notes = dvl(folder, "\n".join(["t,vx,vy,vz,on", *(f"{row},1" for row in FIXED), f"{START + 4},1,2,-8."]))
+    assert len(stream) == 12
+    assert any("cut off" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("rows", "last"),
+    [
+        (FIXED, f"{START + 4},0.1250,0.2500,-8.7060"),
+        (FIXED, f"{START + 4},0.1250,0.2500,-8.\n"),
+        (FIXED[:9], f"{START + 4},0.1250,0.2500,-8."),  # too few to know
+        ([f"{START + i},0,0,{1000 + i}" for i in range(12)], f"{START + 20},0,0,999"),
+        ([f"{START + i},0,0,{i / 4:g}" for i in range(12)], f"{START + 20},0,0,3"),
+    ],
+    ids=["in full", "ended", "short table", "whole numbers", "as short as others"],
+)
+def test_a_last_line_without_an_end_is_kept_quietly(folder: Path, rows: list[str], last: str) -> None:
+    assert cut(folder, rows, last) == (len(rows) + 1, [])
+
+
+def test_a_whole_number_that_is_cut_off_is_found_by_its_length(folder: Path) -> None:
+    rows = [f"{START + i},0,0,{-87060957 - i}" for i in range(12)]
+    assert cut(folder, rows, f"{START + 20},0,0,-8706")[0] == 12
+
+
+# -- hemispheres that are not said
+
+
+@pytest.mark.parametrize("letter", ["", "nan", "NULL", "none", "E", "Nz", "-"])
+def test_what_is_no_hemisphere_is_not_north(folder: Path, letter: str) -> None:
+    rows = "".join(f"{START + i},41.185,{ns}\n" for i, ns in enumerate(["N", "s", " North", "south", letter, "N"]))
+    (folder / "gps.csv").write_text("t,lat,ns\n" + rows)
+    part = {**GPS, "geodetic": {"latitude": "lat", "longitude": "lat", "north_south": "ns"}}
+    with pytest.raises(DatasetError, match=r"gps: row 4 \(1 in all\): no hemisphere: column 'ns' "):
+        opened(folder, {"gps": part})
+    log = opened(folder, {"gps": part}, repair=True)
+    assert log.gps is not None
+    assert len(log.gps) == 5
+
+
+def test_a_column_of_empty_hemispheres_is_refused(folder: Path) -> None:
+    (folder / "gps.csv").write_text("t,lat,ns\n" + "".join(f"{START + i},41.185,\n" for i in range(4)))
+    part = {**GPS, "geodetic": {"latitude": "lat", "longitude": "lat", "north_south": "ns"}}
+    with pytest.raises(DatasetError, match="4 of 4 rows are without a hemisphere"):
+        opened(folder, {"gps": part})
+
+
+# -- truths from files of poses, origins and units of time
+
+
+@pytest.mark.parametrize(
+    "key", [{"frame": "NED"}, {"height_m": 0.0}, {"every": 2}, {"drop_repeats": True}, {"time": {"column": "t"}},
+            {"valid": {"column": "t", "values": [1]}}, {"position": {"columns": ["x", "y", "z"], "unit": "m"}}],
+)  # fmt: skip
+def test_a_key_without_effect_beside_a_file_of_poses_is_refused(folder: Path, key: dict[str, Any]) -> None:
+    (folder / "truth.tum").write_text("".join(f"{START + i} 0 0 0 0 0 0 1\n" for i in range(5)))
+    assert opened(folder, {}, truth={"tum": "truth.tum", "kind": "reference", "until_s": 3}).truth is not None
+    with pytest.raises(DatasetError, match=f"`{next(iter(key))}`: no effect beside `tum`"):
+        opened(folder, {}, truth={"tum": "truth.tum", **key})
+
+
+def test_a_local_truth_beside_a_gps_on_the_globe_asks_for_the_origin(folder: Path) -> None:
+    (folder / "truth.tum").write_text("".join(f"{START + i} 0 0 0 0 0 0 1\n" for i in range(5)))
+    (folder / "gps.csv").write_text("t,lat,lon\n" + "".join(f"{START + i},41.185,-8.7\n" for i in range(4)))
+    origin = {"latitude_deg": 41.185, "longitude_deg": -8.7}
+
+    def checks(**parts: Any) -> list[str]:
+        return [str(note) for note in opened(folder, {"gps": GPS}, **parts).notes if "state `origin`" in note]
+
+    assert len(checks(truth={"tum": "truth.tum"})) == 1
+    assert not checks()
+    assert not checks(truth={"tum": "truth.tum"}, origin=origin)
+
+
+@pytest.mark.parametrize(("factor", "meant"), [(10**3, "ms"), (10**6, "us"), (10**9, "ns")])
+def test_times_in_a_finer_unit_than_said_are_called_so(folder: Path, factor: int, meant: str) -> None:
+    rows = "\n".join(f"{(START + i) * factor},0,0,0" for i in range(5))
+    with pytest.raises(DatasetError, match=rf"dvl: row 0: column 't' is {START * factor}.*seconds: `unit: {meant}`"):
+        dvl(folder, f"t,vx,vy,vz\n{rows}\n")

@@ -129,3 +129,25 @@ def test_a_description_of_many_wrong_values_is_refused_briefly(tmp_path: Path) -
     with pytest.raises(DatasetError, match=r"and 19\d+ more of this kind") as error:
         limited(lambda: read_description(tmp_path / "log.yaml"), megabytes=300)
     assert len(str(error.value)) < 20_000
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: 1\nb: 045\n", "x: line 2: 045 is a number with a leading zero.*; write 45, or put text in quotes"),
+        ("a: [010]", "write 10,"),
+        ("a: -087", "-087 is a number with a leading zero.*write -87,"),
+        ("a: !!int 010", "write 10,"),
+        ("a: 1:30", "1:30 is a number in base 60.*; write a decimal number, or put text in quotes"),
+        ("a: {b: -8:42:06.5}", "base 60"),
+        ("010: a", "write 10,"),
+    ],
+)
+def test_numbers_that_yaml_reads_otherwise_than_they_look_are_refused(text: str, says: str) -> None:
+    with pytest.raises(DatasetError, match=says):
+        parse_yaml(text, "x")
+
+
+def test_other_numbers_and_quoted_text_are_taken() -> None:
+    text = "[0, -0, 0.5, 01.5, 0x1f, '045', \"1:30\", !!str 010, 2024-05-03, a:1]"
+    assert repr(parse_yaml(text, "x")) == repr(yaml.safe_load(text))
