@@ -113,8 +113,9 @@ def sweep(
         tls: certificates for a scheduler at a tls:// address, see `dask_pool`.
 
     Raises:
-        ExperimentError, EstimatorError, DatasetError: nothing was run; or, at the end, a planned run has no result.
-        StoppedError: a result could not be kept, as on a full disk; those before it are in the store.
+        ExperimentError, EstimatorError, DatasetError: nothing was run.
+        StoppedError: a result could not be kept, as on a full disk, or a planned run has none at the end; the others
+            are in the store.
     """
     if not isinstance(experiment, Experiment):
         experiment = Experiment.load(experiment)
@@ -159,13 +160,13 @@ def _refuse_silence(runs: Sequence[Run], rows: pd.DataFrame) -> None:
     """Refuse to end as if all were well where a planned run has no row.
 
     Raises:
-        ExperimentError: names the first such run.
+        StoppedError: names the first such run.
     """
     seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
     told = set(zip(rows["log"], rows["label"], seeds, strict=True))
     silent = [run for run in runs if (run.log.name, run.estimator.label, run.seed) not in told]
     if silent:
-        raise ExperimentError(
+        raise StoppedError(
             f"{len(silent)} of {len(runs)} planned runs have no result, the first is {silent[0]}; finished runs are "
             "kept, and the same command continues"
         )
