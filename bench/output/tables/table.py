@@ -82,10 +82,17 @@ def print_remarks(rows: Rows, console: Console) -> None:
     """Print a line for each run that did not finish, for results not to be trusted, and for what the runs noticed."""
     every = records(rows)
     for line in failures(every) + mostly_outside(every) + not_positive(summarise(every)):
-        console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
+        _print_line(line, "red", console)
     for line, routine in notices.lines(every):
-        told = fill(line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False)
-        console.print(told, style="dim" if routine else "yellow", highlight=False, markup=False, soft_wrap=True)
+        _print_line(line, "dim" if routine else "yellow", console)
+
+
+def _print_line(line: str, style: str, console: Console) -> None:
+    """Print a line, folded between words where it is too long; a longer word stays whole."""
+    told = fill(
+        line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False, break_long_words=False
+    )
+    console.print(told, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> None:

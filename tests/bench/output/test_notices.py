@@ -96,6 +96,17 @@ def test_the_lines_fit_a_terminal(width: int) -> None:
     assert printed.count("cut off 12 bytes") == 1
 
 
+def test_a_cause_is_shown_to_its_end_where_it_says_what_to_do() -> None:
+    cause = f"ValueError: eskf: {'the heading at the start is not known; ' * 5}begin later by `from_s`, or use a filter"
+    console = Console(file=io.StringIO(), width=120)
+    print_remarks(pd.DataFrame([row("dive", "eskf", status="failed", cause=cause)]), console)
+    assert isinstance(console.file, io.StringIO)
+    printed = console.file.getvalue().splitlines()
+    assert " ".join(line.strip() for line in printed) == f"dive / eskf: failed: {cause}"
+    assert max(map(len, printed)) <= 80
+    assert all(line.startswith("  ") for line in printed[1:])
+
+
 def test_the_table_of_the_report_has_every_kind_and_sensor() -> None:
     sheet = notices.sheet([row("dive", "eskf", DROPPED, ALSO, SILENT, gated(12)), row("dive", "fls", DROPPED, ALSO)])
     assert sheet is not None
