@@ -73,6 +73,13 @@ def test_logs_that_say_the_same_share_a_line() -> None:
     ]
 
 
+def test_a_repair_is_told_by_what_was_done() -> None:
+    told = lines(
+        row("dive", "eskf", Note("truth: 47,253 rotations made exact, off by up to 1e-05", "repaired", "truth"))
+    )
+    assert told == ["dive: changed on reading: truth: 47,253 rotations made exact, off by up to 1e-05"]
+
+
 def test_what_is_routine_has_one_line_for_all_logs() -> None:
     told = lines(row("a", "eskf", late(3)), row("b", "eskf", late(30)))
     assert told == ["b: late: 30 of 60 readings (50.0 %) (the most of 2 logs)"]
