@@ -27,8 +27,6 @@ from . import terminal
 
 LETTERS = 80
 """Longest line of what the runs noticed, also where there is more room: longer ones are hard to read."""
-ANY_WIDTH = 10_000
-"""More letters than any table is wide; in less room rich gives the width after cutting."""
 
 
 def write_table(rows: Rows, path: Path) -> None:
@@ -114,7 +112,7 @@ def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> No
 
 def _width(table: Table, console: Console) -> int:
     """Return how many columns of letters a table needs at least."""
-    return console.measure(table, options=console.options.update_width(ANY_WIDTH)).minimum
+    return console.measure(table, options=console.options.update_width(terminal.ANY_WIDTH)).minimum
 
 
 def _whose(sheet: sheets.Sheet) -> list[tuple[str, ...]]:
