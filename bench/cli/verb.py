@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -63,6 +62,6 @@ def refuse(message: str, status: int = BAD_INPUT) -> None:
 
 def say(message: str) -> None:
     """Print on standard error."""
-    from ...datasets.errors import shown
+    from ..saying import say as print_line
 
-    print(shown(message), file=sys.stderr)
+    print_line(message)

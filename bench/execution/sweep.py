@@ -24,6 +24,7 @@ from ..files import writing
 from ..inspection.findings.finding import Finding
 from ..results.identity import FINAL, content_sha256
 from ..results.store import Row, Store, provenance, sole_writer, with_whole_specs
+from ..saying import say
 from .cold_start import compile_first
 from .dask_pool import Tls, run_on_cluster
 from .log_check import Findings, check_log, note_of, report
@@ -128,7 +129,7 @@ def sweep(
     tasks, absent, duration_s, findings = _opened(
         [Task.of(experiment, run, Path(data) if data else None, repair) for run in runs], check
     )
-    report(findings, strict, _say)
+    report(findings, strict, say)
     _make_room(folder)
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
@@ -302,11 +303,6 @@ def _opened(tasks: Sequence[Task], check: bool) -> tuple[list[Task], list[dict[s
     ]
     absent = [task.row("absent", missing[task.run.log.name]) for task in tasks if task.run.log.name in missing]
     return here, absent, duration_s, findings
-
-
-def _say(message: str) -> None:
-    """Print a line on standard error."""
-    Console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
 
 
 def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from textwrap import fill
 
 import pandas as pd
 from rich.cells import cell_len
@@ -20,6 +19,7 @@ from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, Rows, groups, is_judged, records, summarise
 from ...results.summary import consistency as consistency_of
+from ...saying import folded
 from .. import notices, sheets
 from ..cells import Cell
 from ..remarks import failures, mostly_outside, not_positive
@@ -87,9 +87,7 @@ def print_remarks(rows: Rows, console: Console) -> None:
 
 def _print_line(line: str, style: str, console: Console) -> None:
     """Print a line, folded between words where it is too long; a longer word stays whole."""
-    told = fill(
-        line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False, break_long_words=False
-    )
+    told = folded(line, min(console.width, LETTERS))
     console.print(told, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
