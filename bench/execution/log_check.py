@@ -11,7 +11,6 @@ from ...datasets.log import Log
 from ..errors import ExperimentError
 from ..inspection.findings.advice import resolved
 from ..inspection.findings.finding import Finding
-from ..inspection.gross.gross import quick_findings
 
 Findings = Mapping[str, Sequence[Finding]]
 """What looks wrong, by the name of the log."""
@@ -19,6 +18,8 @@ Findings = Mapping[str, Sequence[Finding]]
 
 def check_log(log: Log, name: str, data: Path | None = None) -> tuple[Finding, ...]:
     """Return what looks grossly wrong in a log that `open_log(name, data)` gave, with advice for its log.yaml."""
+    from ..inspection.gross.gross import quick_findings  # loads matplotlib, which takes a second
+
     found = quick_findings(log)
     if not found:
         return ()
