@@ -7,6 +7,7 @@ from pydantic import model_validator
 from pydantic.dataclasses import dataclass
 from scipy.spatial.transform import Rotation
 
+from .notes import Note
 from .quantities import STRICT, Finite, Vector
 from .rig import Mounting
 from .rotations import note, off_rotation, orthonormalised
@@ -36,9 +37,9 @@ class MountingSpec:
         self.mounting()
         return self
 
-    def notes(self, sensor: str) -> tuple[str, ...]:
+    def notes(self, sensor: str) -> tuple[Note, ...]:
         """Return in a sentence that R_BS was orthonormalised; nothing where it was not."""
-        return () if self.R_BS is None else note(f"{sensor}: mounting", off_rotation(np.array([self.R_BS])))
+        return () if self.R_BS is None else note(f"{sensor}: mounting", off_rotation(np.array([self.R_BS])), sensor)
 
     def mounting(self) -> Mounting:
         """Return the mounting as the rig holds it, its rotation without the rounding of its decimals."""

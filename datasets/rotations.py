@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .notes import Note
 from .state import Array
 
 UNHEARD = 1e-7
 """How far single precision (24 bits) rounds a rotation: such a matrix is taken as it is, without a word."""
+ROUNDED = 2e-6
+"""A rotation written to six decimals is not farther off: its rounding is taken out as well, but that is no news."""
 TOLERANCE = 1e-3
 """A rotation written to three decimals is not farther off; what is farther was not meant as one."""
 
@@ -63,15 +66,22 @@ def complaint_of_quaternion(q: Array) -> str:
         return f"not a unit quaternion (|q| = {np.linalg.norm(q):.6g}); it may be {TOLERANCE:g} off"
 
 
-def note(what: str, off: Array) -> tuple[str, ...]:
+def note(what: str, off: Array, stream: str = "") -> tuple[Note, ...]:
     """Return in a sentence that rotations `off` (n,) were orthonormalised; nothing where that cannot be told.
+
+    It is of kind "about" where they are no farther off than six decimals round, else "repaired".
 
     Args:
         what: whose: "heading", "truth".
         off: of those that are kept.
+        stream: the sensor, for a table.
     """
     count = int(np.count_nonzero(off > UNHEARD))
-    return (f"{what}: {count} rotations were up to {np.max(off):.1e} off, and were orthonormalised",) if count else ()
+    if not count:
+        return ()
+    most = np.max(off)
+    text = f"{what}: {count:,} rotation{'s' if count > 1 else ''} made exact, off by up to {most:.1e}"
+    return (Note(text, "repaired" if most > ROUNDED else "about", stream, count, len(off)),)
 
 
 def _row(R: Array) -> str:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .errors import DatasetError
 from .files import regular_file
+from .notes import Note
 from .rotations import TOLERANCE, complaint, is_rotation, note, off_rotation, off_unit, orthonormalised
 from .state import DIM, Array, Belief, NavState, TimeArray
 from .times import far, far_complaint, seconds_to_ns, times_ns
@@ -57,7 +58,7 @@ class Trajectory:
     b_g: Array | None = None
     P: Array | None = None
     lookahead_s: float = 0.0
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.t_ns)

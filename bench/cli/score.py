@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from ...datasets.trajectory import Trajectory
     from ..metrics import Ate
 
@@ -184,12 +186,24 @@ def _score_rows(title: str, numbers: object, over: str) -> list[list[str]]:
 
 
 def _print_scores(rows: list[list[str]]) -> None:
+    """Print a line for each error; on a narrow console, where numbers would be cut, a column for each."""
+    from ..output.tables.terminal import ANY_WIDTH, console
+
+    there, headings = console(), ["", *STATISTICS, "over"]
+    table = _table(headings, rows)
+    if there.measure(table, options=there.options.update_width(ANY_WIDTH)).maximum > there.width:
+        headings, *rows = map(list, zip(headings, *rows, strict=True))
+        table = _table(headings, rows)
+    there.print(table)
+
+
+def _table(headings: list[str], rows: list[list[str]]) -> Table:
     from rich import box
     from rich.table import Table
 
-    from ..output.tables.terminal import console
-
-    table = Table("", *STATISTICS, "over", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in headings:
+        table.add_column(heading, overflow="fold")
     for row in rows:
         table.add_row(*row)
-    console().print(table)
+    return table

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from textwrap import wrap
 from typing import Any
 
 import typer
@@ -15,7 +12,6 @@ from typer.core import TyperCommand
 SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit statuses; 130 is what shells report for a command that Ctrl-C ended (128 + SIGINT)."""
 
-BETWEEN_WORDS: Any = {"break_long_words": False, "break_on_hyphens": False}
 """Paths and values stay whole, to be copied."""
 
 
@@ -67,10 +63,7 @@ def refuse(message: str, status: int = BAD_INPUT) -> None:
 
 
 def say(message: str) -> None:
-    """Print on standard error; on a terminal, lines are folded between words, and indented where they go on."""
-    from ...datasets.errors import shown
+    """Print on standard error."""
+    from ..saying import say as print_line
 
-    width = shutil.get_terminal_size().columns if sys.stderr.isatty() else sys.maxsize
-    for line in message.splitlines():
-        text = shown(" ".join(line.split()))
-        print("\n".join(wrap(text, width, subsequent_indent="  ", **BETWEEN_WORDS)), file=sys.stderr)
+    print_line(message)

@@ -23,10 +23,13 @@ from rich.console import Console
 from ... import estimators
 from ...datasets.compiling.cache import compiled_folder
 from ...estimators.interface import Estimator
+from ...estimators.registry import ESTIMATORS
 from ..experiment.plan import plain
+from ..saying import say
 from .child import Child, start
 
-NOTICE = "compiling the estimators, once on this machine: about half a minute on two cores"
+NOTICE = "compiling, once on this machine"
+DURATION = "; on two cores about half a minute in all"
 HEAVIEST = ("WindowSmoother", "BatchSmoother", "UnscentedKalmanFilter", "InvariantKalmanFilter")
 """Kinds that take longest to compile, in this order; they go first, so that no core ends with a long one alone."""
 SERVE = f"{__name__}:serve"
@@ -44,7 +47,7 @@ def compile_first(wanted: Iterable[Estimator]) -> None:
         for code in warm():
             unknown.pop(code, None)
     queue = sorted(unknown.items(), key=lambda each: _weight(each[1]), reverse=True)
-    progress = Progress(len(queue))
+    progress = Progress([type(estimator) for _, estimator in queue])
     with progress.shown(), ExitStack() as children:
         busy: dict[Any, tuple[Child, str, str]] = {}  # by connection: the child, the code it compiles, and for whom
 
@@ -87,13 +90,14 @@ class Progress:
     """Reports the progress of compiling on standard error, from the first function on.
 
     Args:
-        estimators: how many there are to compile for.
+        kinds: those of the estimators to compile for, one each.
     """
 
-    def __init__(self, estimators: int) -> None:
+    def __init__(self, kinds: list[type]) -> None:
         self._console = Console(stderr=True)
         self._status = self._console.status("checking what is compiled already")
-        self._estimators, self._done, self._functions = estimators, 0, 0
+        self._estimators, self._done, self._functions = len(kinds), 0, 0
+        self._names = dict.fromkeys(name for kind in kinds for name, ours in ESTIMATORS.items() if ours is kind)
         self._began_s = time.monotonic()
 
     @contextmanager
@@ -108,7 +112,7 @@ class Progress:
     def compiling(self, kind: str, function: str) -> None:
         """Say that a function is compiled for a kind of estimator."""
         if not self._functions:
-            print(NOTICE, file=sys.stderr, flush=True)
+            say(f"{NOTICE}: {', '.join(self._names)}{DURATION}")
         self._functions += 1
         self._status.update(
             f"compiling for {kind}: {function}; {self._functions} functions so far, "

@@ -29,7 +29,7 @@ from ...estimators.physics.innovation import INNOVATION, innovations
 from ...estimators.registry import is_ours
 from ..results.identity import content_sha256
 from .noticed import ON_TIME_NS, late_readings, noticed
-from .outputs import check_form, check_smoothed, wrong_value
+from .outputs import check_counts, check_form, check_smoothed, wrong_value
 from .result import Result, Status
 
 LOST_M = 1e7
@@ -87,13 +87,18 @@ class Recorder:
         if self.has_P and not np.isfinite(self.P[k]).all():
             raise Diverged("the covariance is not finite")
 
+    @property
+    def ticks_ns(self) -> TimeArray:
+        """Times of the beliefs that were kept and timed, (n,) ns."""
+        return self.t_ns[: len(self.belief_ns)]
+
     def trajectory(self) -> Trajectory | None:
         """Return the beliefs that were kept and timed; None where there are none."""
         n = len(self.belief_ns)
         if n == 0:
             return None
         p, v, b_a, b_g = (self.vectors[:n, i] for i in range(4))
-        return Trajectory(self.t_ns[:n], self.R_WB[:n], p, v, b_a, b_g, self.P[:n] if self.has_P else None)
+        return Trajectory(self.ticks_ns, self.R_WB[:n], p, v, b_a, b_g, self.P[:n] if self.has_P else None)
 
 
 class NisCollector:
@@ -198,7 +203,7 @@ def run_log(
                 ending = Ending.by(error, voyage.start_ns)
             else:
                 ending = _drive(run, voyage, recorder, limit_ns, collector)
-                smoothed, finish_ns, counts, ending = _finish(run, voyage, ending)
+                smoothed, finish_ns, counts, ending = _finish(run, voyage, recorder.ticks_ns, ending)
     online, ending = _checked(recorder.trajectory(), ending)
     if content is not None and content_sha256(log) != content:
         cause = f"{type(estimator).__name__} changed arrays of the log, the prior or the rig, which other runs use too"
@@ -207,9 +212,8 @@ def run_log(
     driven = voyage.epochs[: len(recorder.step_ns)]
     end_ns = driven[-1].t_ns if driven else voyage.start_ns
     late = late_readings(log, factors, voyage.start_ns, end_ns)
-    counts = (
-        {"readings": readings, "readings_late": late} | voyage.counts | (collector.counts if collector else {}) | counts
-    )
+    known = {"readings": readings, "readings_late": late} | voyage.counts | (collector.counts if collector else {})
+    counts |= known  # what is counted here is no estimator's to say
     return Result(
         ending.status,
         ending.cause,
@@ -298,8 +302,13 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
     return Ending("done")
 
 
-def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | None, int, dict[str, int], Ending]:
-    """Return (smoothed trajectory, time it took, counts, ending); a run that had ended early keeps its own cause."""
+def _finish(
+    run: Pass, voyage: Voyage, given_ns: TimeArray, ending: Ending
+) -> tuple[Trajectory | None, int, dict[str, int], Ending]:
+    """Return (smoothed trajectory, time it took, counts, ending); a run that had ended early keeps its own cause.
+
+    `given_ns` (k,) are the ticks at which it gave a belief.
+    """
     end_ns = voyage.epochs[-1].t_ns if voyage.epochs else voyage.start_ns
     smoothed, counts, end = None, {}, Ending("done")
     started = ended = perf_counter_ns()
@@ -308,9 +317,11 @@ def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | Non
             smoothed = run.finish()
         finally:
             ended = perf_counter_ns()
-            counts = checked_counts(run, type(run).__name__)
+            found = checked_counts(run, type(run).__name__)
+            check_counts(found)
+            counts = found
         if smoothed is not None:
-            end = _smoothed_ending(smoothed, voyage)
+            end = _smoothed_ending(smoothed, voyage, given_ns)
     except BaseException as error:  # another package's code may raise anything
         end = Ending.by(error, end_ns)
     if end.status != "done":
@@ -318,13 +329,14 @@ def _finish(run: Pass, voyage: Voyage, ending: Ending) -> tuple[Trajectory | Non
     return smoothed, ended - started, counts, end if ending.status == "done" else ending
 
 
-def _smoothed_ending(smoothed: Trajectory, voyage: Voyage) -> Ending:
+def _smoothed_ending(smoothed: Trajectory, voyage: Voyage, given_ns: TimeArray) -> Ending:
     """Return how a run ends with these smoothed states: done, unless one of them cannot be.
 
     Raises:
-        Diverged, TypeError, ValueError: they are lost, or no states at the ticks.
+        Diverged, TypeError, ValueError: they are lost, or not the states at the ticks.
     """
-    check_smoothed(smoothed, np.array([epoch.t_ns for epoch in voyage.epochs if epoch.tick], np.int64))
+    ticks_ns = np.array([epoch.t_ns for epoch in voyage.epochs if epoch.tick], np.int64)
+    check_smoothed(smoothed, ticks_ns, given_ns)
     if not (np.abs(smoothed.p_WB_W).max(initial=0.0) < LOST_M):  # nor NaN
         raise Diverged("the smoothed state is not finite, or far beyond the Earth's surface")
     wrong = wrong_value(smoothed)

@@ -7,7 +7,7 @@ tenth of checking one by one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -57,12 +57,17 @@ def _check_array(name: str, values: Any, shape: tuple[int, ...]) -> None:
         raise TypeError(f"{name} of a belief or trajectory must be a float64 array {shape}, found {found}")
 
 
-def check_smoothed(smoothed: Trajectory, ticks_ns: TimeArray) -> None:
-    """Refuse what is no trajectory at the ticks.
+def check_smoothed(smoothed: Trajectory, ticks_ns: TimeArray, given_ns: TimeArray) -> None:
+    """Refuse what is not the trajectory at all ticks: one of some ticks would choose where it is scored.
+
+    Args:
+        smoothed: what `finish` returned.
+        ticks_ns: all ticks of the log, (k,) ns.
+        given_ns: those at which it gave a belief, (n,) ns: all, unless the run ended early.
 
     Raises:
         TypeError: not a Trajectory, or an array in it is of another shape or type.
-        ValueError: a time that is none of the ticks, a value that is not finite, a look-ahead that is none.
+        ValueError: it lacks a tick or has a time that is none; its look-ahead is not positive.
     """
     if not isinstance(smoothed, Trajectory):
         raise TypeError(f"finish() returned {type(smoothed).__name__}, expected a fathom.datasets.Trajectory or None")
@@ -78,8 +83,28 @@ def check_smoothed(smoothed: Trajectory, ticks_ns: TimeArray) -> None:
     elsewhere = np.flatnonzero(~np.isin(t_ns, ticks_ns))
     if len(elsewhere):
         raise ValueError(f"finish(): {t_ns[elsewhere[0]]} ns is no time at which a belief was asked for (epoch.tick)")
-    if not isinstance(smoothed.lookahead_s, int | float) or not smoothed.lookahead_s >= 0:
-        raise ValueError(f"finish(): lookahead_s must be seconds, 0 or more, found {smoothed.lookahead_s!r:.60}")
+    lacking = np.flatnonzero(~np.isin(given_ns, t_ns))
+    if len(lacking):
+        raise ValueError(
+            f"finish(): {n} of {len(given_ns)} ticks; it must return the states at all times at which a belief was "
+            f"asked for, the first without one is {given_ns[lacking[0]]} ns"
+        )
+    if not isinstance(smoothed.lookahead_s, int | float) or not smoothed.lookahead_s > 0:
+        raise ValueError(
+            f"finish(): lookahead_s must be seconds, more than 0, found {smoothed.lookahead_s!r:.60}; a filter, which "
+            "has seen nothing of the future, returns None"
+        )
+
+
+def check_counts(counts: Mapping[str, int]) -> None:
+    """Refuse numbers that count nothing.
+
+    Raises:
+        ValueError: one is negative.
+    """
+    for name, n in counts.items():
+        if n < 0:
+            raise ValueError(f"counts[{name!r}] is {n}; a count is 0 or more")
 
 
 class WrongValue(NamedTuple):

@@ -23,6 +23,7 @@ from ..experiment.plan import Experiment, Run
 from ..files import writing
 from ..results.identity import FINAL, content_sha256
 from ..results.store import Row, Store, provenance, sole_writer, with_whole_specs
+from ..saying import say
 from .cold_start import compile_first
 from .dask_pool import Tls, run_on_cluster
 from .log_check import Findings, check_log, note_of, report
@@ -112,8 +113,9 @@ def sweep(
         tls: certificates for a scheduler at a tls:// address, see `dask_pool`.
 
     Raises:
-        ExperimentError, EstimatorError, DatasetError: nothing was run; or, at the end, a planned run has no result.
-        StoppedError: a result could not be kept, as on a full disk; those before it are in the store.
+        ExperimentError, EstimatorError, DatasetError: nothing was run.
+        StoppedError: a result could not be kept, as on a full disk, or a planned run has none at the end; the others
+            are in the store.
     """
     if not isinstance(experiment, Experiment):
         experiment = Experiment.load(experiment)
@@ -126,7 +128,7 @@ def sweep(
     tasks, absent, duration_s, findings = _opened(
         [Task.of(experiment, run, Path(data) if data else None, repair) for run in runs], check
     )
-    report(findings, strict, _say)
+    report(findings, strict, say)
     _make_room(folder)
     with sole_writer(folder), Store(folder / "runs.sqlite") as store:
         kept = {row["log"]: row["cause"] for row in absent if not store.write_absent(row)}
@@ -158,13 +160,13 @@ def _refuse_silence(runs: Sequence[Run], rows: pd.DataFrame) -> None:
     """Refuse to end as if all were well where a planned run has no row.
 
     Raises:
-        ExperimentError: names the first such run.
+        StoppedError: names the first such run.
     """
     seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
     told = set(zip(rows["log"], rows["label"], seeds, strict=True))
     silent = [run for run in runs if (run.log.name, run.estimator.label, run.seed) not in told]
     if silent:
-        raise ExperimentError(
+        raise StoppedError(
             f"{len(silent)} of {len(runs)} planned runs have no result, the first is {silent[0]}; finished runs are "
             "kept, and the same command continues"
         )
@@ -300,11 +302,6 @@ def _opened(tasks: Sequence[Task], check: bool) -> tuple[list[Task], list[dict[s
     ]
     absent = [task.row("absent", missing[task.run.log.name]) for task in tasks if task.run.log.name in missing]
     return here, absent, duration_s, findings
-
-
-def _say(message: str) -> None:
-    """Print a line on standard error."""
-    Console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
 
 
 def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:

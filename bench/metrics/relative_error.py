@@ -77,20 +77,17 @@ def rpe(
         dims: "2d" takes the horizontal part of the translation error (in W axes) and the horizontal path.
 
     Raises:
-        ScoreError: no such pair (the truth is shorter than delta, or too sparse), bad arguments, or no attitude, which
-            a relative pose needs.
+        ScoreError: no such pair (what matches is shorter than delta, or too sparse), bad arguments, or no attitude,
+            which a relative pose needs.
 
     Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", eqs. (1)-(2).
     """
+    sparser = "estimate" if len(estimate) < len(truth) else "truth"
     truth, estimate = associate(truth, estimate, tolerance_ns)
     p_true, _ = positions(truth, estimate, dims)
     i, j = _choose(truth.t_ns, p_true, delta, unit, pairs)
     if len(i) == 0:
-        span_s, path_m = (truth.t_ns[-1] - truth.t_ns[0]) * 1e-9, travelled(p_true)[-1]
-        raise ScoreError(
-            f"rpe: no pair of poses is {delta} {unit} apart: the truth has {len(truth)} poses over {span_s:.3f} s and "
-            f"{path_m:.3f} m; use a smaller delta, or a denser truth"
-        )
+        raise ScoreError(_no_pair(truth.t_ns, p_true, delta, unit, sparser))
     translation_m, rotation_rad, (i, j) = _relative_errors(
         truth, estimate, _error_rotation(truth, estimate), i, j, dims
     )
@@ -223,6 +220,24 @@ def _choose(t_ns: TimeArray, p: Array, delta: float, unit: Unit, pairs: Pairs) -
         i, j = _chain(np.diff(t_ns), delta_ns)
     on_time = t_ns[j] - t_ns[i] - delta_ns <= STEP_TOLERANCE * delta_ns
     return i[on_time], j[on_time]
+
+
+def _no_pair(t_ns: TimeArray, p: Array, delta: float, unit: Unit, sparser: str) -> str:
+    """Return why no two matched poses are delta apart, and which delta to use; `sparser` has fewer poses."""
+    path_m, span_s = travelled(p), (t_ns - t_ns[0]) * 1e-9
+    along = {"frames": np.arange(len(t_ns)), "s": span_s, "m": path_m}[unit]
+    step = float(np.median(np.diff(along))) if len(along) > 1 else 0.0
+    apart = f", each about {step:.3g} {unit} from the next" if step and unit != "frames" else ""
+    if along[-1] < delta:
+        advice = "use a smaller delta"
+    elif step > delta:
+        advice = f"use a larger delta, or a denser {sparser}"
+    else:
+        advice = f"use a delta of one or several such steps, or a denser {sparser}"
+    return (
+        f"rpe: no pair of poses is {delta} {unit} apart: {len(t_ns)} poses match, over {span_s[-1]:.3f} s and "
+        f"{path_m[-1]:.3f} m{apart}; {advice}"
+    )
 
 
 def _nearest_on_path(path_m: Array, delta_m: float) -> RowPairs:

@@ -35,7 +35,7 @@ WORDS = {
 assert list(WORDS) == [kind for kind in KINDS if kind != "about"]
 ROUTINE = ("outside", "late", "merged", "carried", "void")
 """Kinds that are no fault of a log; the terminal has one line for each, of the log where it is most."""
-IN_WORDS = ("damage", "check", "silent", "start")
+IN_WORDS = ("damage", "check", "silent", "repaired", "start")
 """Kinds whose sentences say more than a number."""
 TEXT_LETTERS = 150
 """Of a note's sentence in a line: two lines of a terminal of 80 columns."""

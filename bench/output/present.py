@@ -6,16 +6,15 @@ from collections.abc import Collection
 from pathlib import Path
 
 import pandas as pd
-import typer
 from rich.console import Console
 
-from ...datasets.errors import shown
 from ..execution.sweep import Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
 from ..files import writing
 from ..results.paired import paired
 from ..results.store import load_runs
 from ..results.summary import Record, Records, Rows, groups, records
+from ..saying import say
 from .remarks import absence
 from .tables import terminal
 from .tables.latex import write_latex
@@ -27,11 +26,6 @@ from .tables.table import (
     write_paired,
     write_table,
 )
-
-
-def say(message: str) -> None:
-    """Print on standard error."""
-    typer.echo(shown(message), err=True)
 
 
 def print_log(rows: pd.DataFrame, plan: Experiment) -> None:

@@ -11,8 +11,8 @@ from textwrap import shorten
 from ..results.summary import Record, ended_at_gap, groups
 
 NO_CAUSE = "no cause is recorded"
-CAUSE_WIDTH = 160
-"""Letters of a cause that a line shows: two lines of a terminal of 80 columns."""
+CAUSE_WIDTH = 400
+"""Letters of a cause that are shown: what went wrong and what to do about it, on five lines of 80 columns."""
 
 
 def failures(rows: Sequence[Record]) -> list[str]:

@@ -81,11 +81,11 @@ def build_log(description: d.Description, folder: Path, *, repair: bool = False)
     truth = None
     if truth_part is not None:
         truth = _truth(opening, truth_part, truth_rows, origin)
-        opening.notes += (Note(f"truth: {mended}", "repaired", "truth") for mended in truth.notes)
+        opening.notes += map(_of_truth, truth.notes)
     for name, part in description.parts.items():
         mounting = getattr(part, "mounting", None)
-        opening.notes += (Note(text, "repaired", name) for text in (() if mounting is None else mounting.notes(name)))
-    opening.notes += (Note(text, "repaired") for text in (() if description.prior is None else description.prior.notes))
+        opening.notes += () if mounting is None else mounting.notes(name)
+    opening.notes += () if description.prior is None else description.prior.notes
 
     with _named(folder):
         mountings = {
@@ -219,13 +219,13 @@ def _put_rotations(rows: Rows, part: d.Attitude, origin: tuple[float, float] | N
         off = off_rotation(R)
         good = is_rotation(off)
         rows.refuse(~good, lambda row: complaint(R[row]), "without a rotation")
-        rows.opening.notes += (Note(text, "repaired", rows.stream) for text in note(rows.stream, off[good]))
+        rows.opening.notes += note(rows.stream, off[good], rows.stream)
         R = orthonormalised(R[good], off[good])
     else:
         off = off_unit(values)
         good = is_rotation(off)
         rows.refuse(~good, lambda row: complaint_of_quaternion(values[row]), "without a unit quaternion")
-        rows.opening.notes += (Note(text, "repaired", rows.stream) for text in note(rows.stream, off[good]))
+        rows.opening.notes += note(rows.stream, off[good], rows.stream)
         q_xyzw = values[good] if part.form == "quaternion_xyzw" else np.roll(values[good], -1, axis=1)
         R = Rotation.from_quat(q_xyzw).as_matrix().reshape(-1, 3, 3)
     if part.world == "NED":
@@ -267,6 +267,11 @@ def _truth(
     found = rows.values
     R = found["R"] if "R" in found else np.full((len(rows.t_ns), 3, 3), np.nan)
     return Trajectory(rows.t_ns, R, found["p"], found.get("v"), lookahead_s=part.lookahead_s)
+
+
+def _of_truth(mended: Note) -> Note:
+    """Return what was mended in a trajectory as a note on the truth of a log."""
+    return Note(f"truth: {mended.removeprefix('trajectory: ')}", mended.kind, "truth", mended.count, mended.of)
 
 
 def _read_trajectory(path: Path, lookahead_s: float) -> Trajectory:

@@ -18,6 +18,7 @@ from ..formats.recording import Recording, loader
 from ..formats.table import Column, Part, Table
 from ..formats.yaml_file import read_yaml
 from ..mounting import Matrix, MountingSpec
+from ..notes import Note
 from ..quantities import DEGREE, Finite, Latitude, Longitude, NotNegative, Number, Positive, Vector, Whole
 from ..rig import ImuNoise
 from ..rotations import complaint, is_rotation, note, off_rotation, orthonormalised
@@ -608,7 +609,7 @@ class PriorDescription(Part):
         return Belief(self.t_ns, NavState(orthonormalised(R_WB, off_rotation(R_WB)), *vectors), np.array(self.P))
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Note, ...]:
         """That R_WB was orthonormalised, in a sentence; nothing where it was not."""
         return note("prior", off_rotation(np.array([self.R_WB])))
 

@@ -35,7 +35,16 @@ def test_a_rounded_matrix_becomes_the_nearest_rotation_with_a_note(decimals: int
     assert is_rotation(off).all()
     assert off_rotation(mended).max() < UNHEARD
     np.testing.assert_allclose(mended, R, rtol=0, atol=1.5 * 10**-decimals)
-    assert note("truth", off)[0].startswith(f"truth: {np.count_nonzero(off > UNHEARD)} rotations were up to ")
+    (told,) = note("truth", off, "truth")
+    assert told == f"truth: {np.count_nonzero(off > UNHEARD)} rotations made exact, off by up to {off.max():.1e}"
+    assert (told.kind, told.stream) == ("about" if decimals == 6 else "repaired", "truth")
+    assert (told.count, told.of) == (np.count_nonzero(off > UNHEARD), 200)
+
+
+def test_rounding_to_six_decimals_is_no_news_for_any_quaternion_or_matrix() -> None:
+    many = Rotation.random(20_000, random_state=2)
+    for off in (off_rotation(many.as_matrix().round(6)), off_unit(many.as_quat().round(6))):
+        assert [told.kind for told in note("truth", off)] == ["about"]
 
 
 def test_the_nearest_rotation_is_that_of_the_least_squares_problem() -> None:

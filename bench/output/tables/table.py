@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from textwrap import fill
 
 import pandas as pd
 from rich.cells import cell_len
@@ -20,6 +19,7 @@ from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, Rows, groups, is_judged, records, summarise
 from ...results.summary import consistency as consistency_of
+from ...saying import folded
 from .. import notices, sheets
 from ..cells import Cell
 from ..remarks import failures, mostly_outside, not_positive
@@ -27,8 +27,6 @@ from . import terminal
 
 LETTERS = 80
 """Longest line of what the runs noticed, also where there is more room: longer ones are hard to read."""
-ANY_WIDTH = 10_000
-"""More letters than any table is wide; in less room rich gives the width after cutting."""
 
 
 def write_table(rows: Rows, path: Path) -> None:
@@ -82,10 +80,15 @@ def print_remarks(rows: Rows, console: Console) -> None:
     """Print a line for each run that did not finish, for results not to be trusted, and for what the runs noticed."""
     every = records(rows)
     for line in failures(every) + mostly_outside(every) + not_positive(summarise(every)):
-        console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
+        _print_line(line, "red", console)
     for line, routine in notices.lines(every):
-        told = fill(line, min(console.width, LETTERS), subsequent_indent="  ", break_on_hyphens=False)
-        console.print(told, style="dim" if routine else "yellow", highlight=False, markup=False, soft_wrap=True)
+        _print_line(line, "dim" if routine else "yellow", console)
+
+
+def _print_line(line: str, style: str, console: Console) -> None:
+    """Print a line, folded between words where it is too long; a longer word stays whole."""
+    told = folded(line, min(console.width, LETTERS))
+    console.print(told, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
 def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> None:
@@ -107,7 +110,7 @@ def print_sheet(sheet: sheets.Sheet, console: Console, noted: bool = True) -> No
 
 def _width(table: Table, console: Console) -> int:
     """Return how many columns of letters a table needs at least."""
-    return console.measure(table, options=console.options.update_width(ANY_WIDTH)).minimum
+    return console.measure(table, options=console.options.update_width(terminal.ANY_WIDTH)).minimum
 
 
 def _whose(sheet: sheets.Sheet) -> list[tuple[str, ...]]:

@@ -16,6 +16,8 @@ from ....datasets.errors import shown
 
 WIDTH = 120
 """Columns of output to a file or a pipe: enough for the tables of README."""
+ANY_WIDTH = 10_000
+"""More letters than any table is wide; in less room rich gives the width after cutting."""
 NAME_WIDTH = 14
 """The column of names has at least this many letters: narrower, names would be hard to read."""
 LONGEST_WORD = 32

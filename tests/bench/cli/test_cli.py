@@ -214,6 +214,18 @@ def test_score_prints_errors_with_their_alignment(tmp_path: Path) -> None:
     assert call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--unit", "feet")[0] == 2
 
 
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_score_cuts_no_number_on_a_narrow_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int) -> None:
+    monkeypatch.setattr("fathom.bench.output.tables.terminal.WIDTH", width)
+    circle().to_tum(tmp_path / "truth.tum")
+    circle(12345.678901).to_tum(tmp_path / "estimate.tum")
+    code, out, _ = call("score", tmp_path / "truth.tum", tmp_path / "estimate.tum", "--delta", 6)
+    assert (code, "…" in out) == (0, False)
+    assert out.count("12345.678901") == 5  # all statistics but the standard deviation
+    assert "200 poses" in out
+    assert max(map(len, out.splitlines())) <= max(width, 80)
+
+
 def test_score_says_how_many_poses_match_and_what_would_match_more(tmp_path: Path) -> None:
     truth = circle()
     files = {"truth": truth, "late": replace(truth, t_ns=truth.t_ns + 3 * 10**9)}

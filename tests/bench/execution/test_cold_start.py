@@ -63,7 +63,7 @@ def test_the_first_time_is_reported_once_and_the_second_time_nothing_is_done(
     compile_first(wanted)
     assert asked(folder) == ["WindowSmoother", "ErrorStateKalmanFilter"]  # the heaviest first
     said = capfd.readouterr().err
-    assert said.count(NOTICE) == 1
+    assert said.count(f"{NOTICE}: window, eskf; ") == 1
     assert "compiled for WindowSmoother, 1 of 2: 1 functions" in said
     assert "compiled for ErrorStateKalmanFilter, 2 of 2: 2 functions" in said
     compile_first(wanted)
@@ -114,5 +114,5 @@ def test_a_run_on_an_empty_cache_says_that_it_compiles_and_the_next_one_does_not
     said = [
         subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr for _ in range(2)
     ]
-    assert said[0].startswith(NOTICE)
+    assert said[0].startswith(f"{NOTICE}: dead-reckoning; ")
     assert NOTICE not in said[1]

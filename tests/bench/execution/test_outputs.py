@@ -15,6 +15,7 @@ from fathom.datasets import Belief, Log, NavState, Scenario, Trajectory, simulat
 from fathom.estimators import ESTIMATORS, FACTORS, create
 
 SPOILT_S = 3
+TICKS = 20
 LOG = simulate(Scenario(duration_s=20.0), seed=2)
 
 
@@ -108,7 +109,7 @@ def test_from_the_first_belief_on_there_is_no_trajectory_at_all() -> None:
 
 
 def track(**changes: Any) -> Trajectory:
-    t_ns = LOG.start_ns + 10**9 * np.arange(1, 6)
+    t_ns = LOG.start_ns + 10**9 * np.arange(1, TICKS + 1)
     x = NavState(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
     right = Trajectory.from_beliefs([Belief(int(t), x, np.eye(15)) for t in t_ns], lookahead_s=1.0)
     return replace(right, **{name: change(getattr(right, name)) for name, change in changes.items()})
@@ -138,15 +139,21 @@ def with_row(row: int, value: Any) -> Callable[[np.ndarray], np.ndarray]:
         (lambda: track(P=with_row(2, -np.eye(15))), "diverged", "finish(): P is not positive semidefinite"),
         (lambda: track(v_WB_W=with_row(2, np.nan)), "diverged", "finish(): v_WB_W is not finite"),
         (lambda: track(p_WB_W=with_row(2, np.nan)), "diverged", "the smoothed state is not finite"),
-        (lambda: track(p_WB_W=lambda p: p.astype(complex)), "failed", "found complex128 (5, 3)"),
+        (lambda: track(p_WB_W=lambda p: p.astype(complex)), "failed", "found complex128 (20, 3)"),
         (lambda: track(t_ns=lambda t: t + 5), "failed", "no time at which a belief was asked for"),
         (lambda: track(t_ns=lambda t: t + 10**12), "failed", "no time at which a belief was asked for"),
         (lambda: track(t_ns=lambda t: t * 1e-9), "failed", "must be int64 nanoseconds, found float64"),
         (lambda: track(t_ns=lambda t: t[::-1]), "failed", "is not after the row above"),
-        (lambda: sneaked("t_ns", lambda t: t[[0, 1, 1, 3, 4]]), "failed", "the times are not in order"),
+        (lambda: sneaked("t_ns", lambda t: t[[0, 1, 1, *range(3, TICKS)]]), "failed", "the times are not in order"),
         (lambda: sneaked("p_WB_W", lambda p: p[:2]), "failed", "found float64 (2, 3)"),
         (lambda: track(lookahead_s=lambda _: float("nan")), "failed", "lookahead_s must be seconds"),
+        (lambda: track(lookahead_s=lambda _: 0.0), "failed", "lookahead_s must be seconds, more than 0, found 0.0"),
+        (lambda: track(lookahead_s=lambda _: -1.0), "failed", "lookahead_s must be seconds"),
         (lambda: track(lookahead_s=lambda _: "all"), "failed", "lookahead_s must be seconds"),
+        (lambda: track().select(slice(0, 0)), "failed", "finish(): 0 of 20 ticks; it must return the states at all"),
+        (lambda: track().select(slice(6)), "failed", "finish(): 6 of 20 ticks"),
+        (lambda: track().select(slice(1, None)), "failed", "the first without one is 1000000000 ns"),
+        (lambda: track().select(np.arange(TICKS) != 7), "failed", "the first without one is 8000000000 ns"),
         (lambda: "a track", "failed", "finish() returned str, expected a fathom.datasets.Trajectory or None"),
     ],
 )
@@ -258,6 +265,19 @@ def test_counts_that_turn_odd_during_the_run_fail_it() -> None:
     assert "`counts` must be" in str(result.cause)
 
 
+def test_what_the_harness_counts_is_not_the_estimators_to_say() -> None:
+    def claimed(**counts: int) -> dict[str, int]:
+        return run_log(LOG, Still(counts=counts)).counts
+
+    assert claimed(imu_gaps_bridged=9, readings=10**9, readings_void=5, mine=4) == claimed() | {"mine": 4}
+
+
+def test_a_negative_count_is_a_failed_run() -> None:
+    result = run_log(LOG, Still(counts={"gated": -5}))
+    assert (result.status, result.cause) == ("failed", "ValueError: counts['gated'] is -5; a count is 0 or more")
+    assert run_log(LOG, Still(counts={"gated": 0})).status == "done"
+
+
 def content(log: Log) -> list[bytes]:
     assert log.truth is not None
     assert log.prior is not None
@@ -325,3 +345,4 @@ def test_ours_pass_as_others_do(name: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert ours.status == "done", ours.cause
     for output in ours.outputs.values():
         assert wrong_value(output) is None
+        assert len(output) == TICKS

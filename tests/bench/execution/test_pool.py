@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from fathom.bench.errors import ExperimentError
+from fathom.bench.errors import StoppedError
 from fathom.bench.execution import pool
 from fathom.bench.execution import sweep as sweeping
 from fathom.bench.execution.child import start
@@ -178,7 +178,7 @@ def test_a_planned_run_without_a_row_is_an_error(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(sweeping, "run_all", forgetful)
     monkeypatch.setattr(sweeping, "compile_first", lambda wanted: None)
-    with pytest.raises(ExperimentError, match=r"1 of 2 planned runs have no result, the first is lawnmower-.* / b"):
+    with pytest.raises(StoppedError, match=r"1 of 2 planned runs have no result, the first is lawnmower-.* / b"):
         sweeping.sweep(PLAN, out=tmp_path)
 
 

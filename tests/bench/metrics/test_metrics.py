@@ -474,8 +474,29 @@ def test_a_vehicle_that_stays_has_rpe_in_frames_and_seconds_but_none_in_metres()
     for pairs in ("all", "consecutive"):
         with pytest.raises(ScoreError, match=r"0\.000 m"):
             rpe(still, still, 1.0, "m", pairs)
-    with pytest.raises(ScoreError, match="1 poses"):
+    with pytest.raises(ScoreError, match="1 poses match"):
         rpe(straight_line(1), straight_line(1))
+
+
+@pytest.mark.parametrize(
+    ("every", "delta", "unit", "says"),
+    [
+        (17, 1.0, "m", "over 8.500 s and 85.000 m, each about 17 m from the next; use a larger delta, or a denser est"),
+        (17, 1.0, "s", "each about 1.7 s from the next; use a larger delta, or a denser estimate"),
+        (2, 3.0, "m", "each about 2 m from the next; use a delta of one or several such steps, or a denser estimate"),
+        (
+            1,
+            500.0,
+            "m",
+            "101 poses match, over 10.000 s and 100.000 m, each about 1 m from the next; use a smaller delta",
+        ),
+        (1, 101.0, "frames", "over 10.000 s and 100.000 m; use a smaller delta"),
+    ],
+)
+def test_why_there_is_no_rpe_says_how_far_apart_the_matched_poses_are(every, delta, unit, says):
+    with pytest.raises(ScoreError) as caught:
+        rpe(straight_line(), straight_line().select(slice(None, None, every)), delta, unit, "all")
+    assert says in str(caught.value)
 
 
 def test_relative_scores_without_attitude_are_errors():

@@ -73,6 +73,13 @@ def test_logs_that_say_the_same_share_a_line() -> None:
     ]
 
 
+def test_a_repair_is_told_by_what_was_done() -> None:
+    told = lines(
+        row("dive", "eskf", Note("truth: 47,253 rotations made exact, off by up to 1e-05", "repaired", "truth"))
+    )
+    assert told == ["dive: changed on reading: truth: 47,253 rotations made exact, off by up to 1e-05"]
+
+
 def test_what_is_routine_has_one_line_for_all_logs() -> None:
     told = lines(row("a", "eskf", late(3)), row("b", "eskf", late(30)))
     assert told == ["b: late: 30 of 60 readings (50.0 %) (the most of 2 logs)"]
@@ -94,6 +101,17 @@ def test_the_lines_fit_a_terminal(width: int) -> None:
     printed = console.file.getvalue()
     assert max(map(len, printed.splitlines())) <= 80
     assert printed.count("cut off 12 bytes") == 1
+
+
+def test_a_cause_is_shown_to_its_end_where_it_says_what_to_do() -> None:
+    cause = f"ValueError: eskf: {'the heading at the start is not known; ' * 5}begin later by `from_s`, or use a filter"
+    console = Console(file=io.StringIO(), width=120)
+    print_remarks(pd.DataFrame([row("dive", "eskf", status="failed", cause=cause)]), console)
+    assert isinstance(console.file, io.StringIO)
+    printed = console.file.getvalue().splitlines()
+    assert " ".join(line.strip() for line in printed) == f"dive / eskf: failed: {cause}"
+    assert max(map(len, printed)) <= 80
+    assert all(line.startswith("  ") for line in printed[1:])
 
 
 def test_the_table_of_the_report_has_every_kind_and_sensor() -> None:

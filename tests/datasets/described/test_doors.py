@@ -10,6 +10,7 @@ import pytest
 import yaml
 from fathom.datasets import DatasetError, Log, Mounting, Scenario, Trajectory, open_log, simulate
 from fathom.datasets.log import AttitudeStream
+from fathom.datasets.notes import Note
 from fathom.datasets.rotations import UNHEARD, off_rotation
 from scipy.spatial.transform import Rotation
 
@@ -84,7 +85,7 @@ def test_a_matrix_of_six_decimals_is_orthonormalised_with_a_note(door: Any, tmp_
     found, notes = door(tmp_path, TRUE.as_matrix().round(6))
     assert off_rotation(found) < 1e-14
     np.testing.assert_allclose(found, TRUE.as_matrix(), rtol=0, atol=1e-6)
-    assert [note for note in notes if "1 rotations were up to" in note and "orthonormalised" in note]
+    assert [note for note in notes if "1 rotation made exact, off by up to" in note]
 
 
 @pytest.mark.parametrize("door", DOORS)
@@ -114,7 +115,9 @@ def test_quaternions_of_four_decimals_are_normalised_with_a_note(tmp_path: Path)
     log = opened(tmp_path, truth={"tum": "truth.tum"})
     assert log.truth is not None
     assert off_rotation(log.truth.R_WB).max() < 1e-14
-    assert "truth: trajectory: 1 rotations were up to" in " ".join(log.notes)
+    (told,) = (note for note in log.notes if note.startswith("truth: 1 rotation made exact, off by up to "))
+    assert isinstance(told, Note)
+    assert (told.kind, told.stream, told.count, told.of) == ("repaired", "truth", 1, 2)
 
 
 def test_types_take_rotations_that_are_mended_already() -> None:
