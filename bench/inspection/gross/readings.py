@@ -17,7 +17,7 @@ from ....datasets.state import Array
 from ..findings.finding import Finding
 from ..findings.fitting import Mask
 from ..streams.channels import Channel, channels_of, imu_period_ns
-from ..streams.frozen import LONG_ROWS, frozen_findings
+from ..streams.frozen import SAME_ANGLE, frozen_findings
 from ..streams.missing import missing_rows, readings_of
 from ..streams.neighbours import outliers, residuals, robust_sigma, stretches
 from ..streams.outliers import outlier_finding
@@ -89,8 +89,10 @@ def _moves(log: Log, channel: Channel) -> bool:
 
 
 def _repeats(channel: Channel) -> bool:
-    first = channel.x[:, int(np.argmax(np.isfinite(channel.sigma)))]
-    return np.count_nonzero(np.abs(np.diff(first)) < 1e-12) >= LONG_ROWS
+    """Whether readings a second apart are ever alike, as they are in any stuck piece."""
+    period_ns = max(int(channel.t_ns[-1] - channel.t_ns[0]) // (len(channel.x) - 1), 1)
+    first = channel.x[:: max(10**9 // period_ns, 1), int(np.argmax(np.isfinite(channel.sigma)))]
+    return bool((np.abs(np.diff(first)) < SAME_ANGLE).any())
 
 
 def _single(channel: Channel) -> list[Finding]:
