@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from ...datasets.log import Log
 from .findings.advice import resolved
 from .findings.finding import Check, Finding
 from .gross.gross import gross_check, unsaid
+from .gross.readings import reading_findings, without
 from .streams.imu_noise import check_imu_noise
 from .streams.noise import check_noise
 from .streams.norms import check_norms
@@ -110,7 +110,7 @@ def _check_sizes(name: str | Path, log: Log) -> None:
 def inspect_log(log: Log, repairs: Sequence[str] = (), description: Description | None = None) -> Inspection:
     """Run every check on a log.
 
-    Streams in which a gross fault is found are left out of the finer comparisons, which would blame others for it.
+    Streams in which a gross fault is found are left out of the comparisons after it, which would blame others for it.
 
     Args:
         log: the log.
@@ -120,19 +120,15 @@ def inspect_log(log: Log, repairs: Sequence[str] = (), description: Description 
     from .between.cross_checks import cross_checks
 
     checks = [_check_repairs(log, repairs), *(check(log) for check in SINGLE)]
-    gross = gross_check(log)
-    gross = replace(gross, findings=unsaid([f for check in checks for f in check.findings], gross.findings))
-    faulty = {finding.stream for finding in gross.findings}
-    checks += [gross, *([] if "imu" in faulty else cross_checks(_without(log, faulty)))]
+    broken = {finding.stream for finding in reading_findings(log)}
+    if "imu" not in broken:
+        gross = gross_check(without(log, broken))
+        gross = replace(gross, findings=unsaid([f for check in checks for f in check.findings], gross.findings))
+        faulty = broken | {finding.stream for finding in gross.findings}
+        checks += [gross, *([] if "imu" in faulty else cross_checks(without(log, faulty)))]
     if description is not None:
         checks = [replace(c, findings=tuple(resolved(f, description) for f in c.findings)) for c in checks]
     return Inspection(log, tuple(checks))
-
-
-def _without(log: Log, streams: set[str]) -> Log:
-    """Return the log without some streams."""
-    absent: dict[str, Any] = dict.fromkeys(streams)
-    return replace(log, **absent) if absent else log
 
 
 def _check_repairs(log: Log, repairs: Sequence[str]) -> Check:

@@ -16,6 +16,7 @@ from ..findings.finding import Check, Finding
 from ..streams.norms import NO_GRAVITY, check_norms
 from .axes import CLEARLY, SURELY, agreement, axes_findings, best, hypotheses, is_upright, scale_findings
 from .plane import heading_fits, heard_under_water, plane_findings
+from .readings import reading_findings, without
 from .relations import tilting, turning
 from .shifts import shift_of
 from .sketch import Sketch, sketch_of
@@ -33,17 +34,20 @@ RUNNING_S = 3.0
 
 
 def quick_findings(log: Log) -> tuple[Finding, ...]:
-    """Return what looks grossly wrong: gravity, units, axes, clocks, coordinates, sign of depth, stated noise.
+    """Return what looks grossly wrong: readings, gravity, units, axes, clocks, coordinates, sign of depth, noise.
 
     It takes milliseconds: less than a twentieth of a run of `eskf`.
     """
     log = _speaking(log)
+    readings = reading_findings(log)
+    broken = {finding.stream for finding in readings}
+    log = without(log, broken)
     sketch = sketch_of(log)
-    if sketch is None:
-        return ()
+    if sketch is None or "imu" in broken:
+        return tuple(readings)
     coarse = replace(log, imu=ImuStream(_times(sketch), sketch.w_I, sketch.f_I))
     single = check_norms(coarse).findings
-    return (*single, *unsaid(single, gross_check(log, sketch).findings))
+    return (*readings, *single, *unsaid(single, gross_check(log, sketch).findings))
 
 
 def gross_check(log: Log, sketch: Sketch | None = None) -> Check:

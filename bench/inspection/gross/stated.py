@@ -7,6 +7,7 @@ import numpy as np
 from ....datasets.log import Log, ReadingStream
 from ....datasets.quantities import DEGREE
 from ..findings.finding import Finding
+from ..streams.channels import imu_period_ns
 
 SLOWEST_IMU_HZ = 2.0
 """Below this an IMU's samples say nothing of a vehicle's motion between them: its time is in another unit."""
@@ -23,13 +24,16 @@ FEWEST = 50
 """With fewer, none is."""
 OVERCONFIDENT = 30.0
 """Scatter over stated sigma: readings then count a thousand times too much."""
+UNDERCONFIDENT, WORTHLESS = 100.0, {"dvl": 0.5, "depth": 5.0, "gps": 100.0, "heading": 45 * DEGREE}
+"""Stated sigma over scatter, and the least stated sigma, SI, that make a finding: such readings then hardly count.
+Slow errors do not scatter, so that a smaller sigma may be right."""
 SECOND_DIFFERENCE = np.sqrt(6.0)
 """Standard deviation of x₀ − 2x₁ + x₂ over that of x, for white noise."""
 
 
 def time_findings(log: Log) -> list[Finding]:
     """Find streams whose times are in another unit than the IMU's."""
-    hz = 1e9 / log.imu.period_ns
+    hz = 1e9 / imu_period_ns(log.imu)
     spans = {name: int(s.t_ns[-1]) - int(s.t_ns[0]) for name, s in log.streams.items() if len(s) >= FEWEST}
     imu_ns = int(log.imu.t_ns[-1]) - int(log.imu.t_ns[0])
     factors = {name: factor for name, span in spans.items() if (factor := _unit_ratio(span / imu_ns)) is not None}
@@ -58,7 +62,7 @@ def _other_unit(name: str, factor: float, than: str) -> Finding:
 
 
 def sigma_findings(log: Log) -> list[Finding]:
-    """Find stated sigmas that no sensor has, or that are far below the scatter of the readings."""
+    """Find stated sigmas that no sensor has, or that the scatter of the readings contradicts."""
     found = []
     for name, stream in log.streams.items():
         if not len(stream):
@@ -68,7 +72,7 @@ def sigma_findings(log: Log) -> list[Finding]:
         sigma = np.median(stream.sigma, axis=0)
         sigma = sigma[np.isfinite(sigma)]
         key = f"streams.{name}." + {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(name, "sigma_m")
-        scatter = _scatter(stream)
+        scatter, most = _scatter(stream)
         odd = sigma[(sigma > largest) | (sigma < least)]
         if len(odd):
             message = f"The stated sigma of the {name} is {odd[0] * shown:.3g} {unit}, which is no sensor's."
@@ -80,19 +84,27 @@ def sigma_findings(log: Log) -> list[Finding]:
                 f"{scatter / sigma.max():.0f} times the stated sigma."
             )
             found.append(Finding(name, message, f"{key}: {scatter * shown:.2g}"))
+        elif len(sigma) and sigma.min() > max(WORTHLESS[name], UNDERCONFIDENT * most) and scatter > least:
+            message = (
+                f"The stated sigma of the {name} is {sigma.min() * shown:.3g} {unit}, and it scatters from reading to "
+                f"reading by {most * shown:.3g} {unit}: its readings hardly count."
+            )
+            hint = "unless its slow errors are as large as stated"
+            found.append(Finding(name, message, f"{key}: {most * shown:.2g}", hint))
     return found
 
 
-def _scatter(stream: ReadingStream) -> float:
-    """Return a robust sigma of the noise of the best measured axis, SI, motion of a constant rate left out; or zero."""
+def _scatter(stream: ReadingStream) -> tuple[float, float]:
+    """Return robust sigmas of the noise of the best and the worst measured axis, SI, constant rates left out; or 0."""
     n = len(stream)
     if n < FEWEST or stream.width == 9:
-        return 0.0
+        return 0.0, 0.0
     rows = slice(max((n - ROWS) // 2, 0), (n + ROWS) // 2)
     z = stream.z[rows][:, np.isfinite(stream.sigma[rows]).all(axis=0)]
     if not z.shape[1]:
-        return 0.0
+        return 0.0, 0.0
     step = np.diff(z, axis=0)
     step = np.angle(np.exp(1j * step)) if stream.name == "heading" else step
     second = np.abs(np.diff(step, axis=0))
-    return float((1.4826 * np.median(second, axis=0) / SECOND_DIFFERENCE).min())
+    sigma = 1.4826 * np.median(second, axis=0) / SECOND_DIFFERENCE
+    return float(sigma.min()), float(sigma.max())

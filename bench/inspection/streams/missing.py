@@ -1,4 +1,4 @@
-"""Rows without a reading: a marker value that the device writes instead, and zeros on every axis."""
+"""Rows without a reading: a marker value that the device writes instead, zeros on every axis, and stuck pieces."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..findings.fitting import MAD_TO_SIGMA
 from .channels import Channel
+from .frozen import frozen_rows
 from .neighbours import FEWEST
 
 FEWEST_MARKED = 3
@@ -22,16 +23,17 @@ NEAR_ZERO = 0.1
 
 @dataclass(frozen=True, eq=False)
 class MissingRows:
-    """Rows (n,) without a reading: those with the value `marker` on some axis, and those of zeros."""
+    """Rows (n,) without a reading: those with the value `marker` on some axis, of zeros, and stuck."""
 
     marked: NDArray[np.bool_]
     zero: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
     marker: float = 0.0
 
     @property
     def readings(self) -> NDArray[np.bool_]:
         """The other rows."""
-        return ~(self.marked | self.zero)
+        return ~(self.marked | self.zero | self.frozen)
 
 
 @lru_cache(maxsize=16)
@@ -41,7 +43,7 @@ def missing_rows(channel: Channel) -> MissingRows:
     x = channel.raw[:, measured]
     marked, zero, marker = np.zeros(len(x), bool), np.zeros(len(x), bool), 0.0
     if len(x) < FEWEST or x.shape[1] == 0:
-        return MissingRows(marked, zero)
+        return MissingRows(marked, zero, frozen_rows(channel))
     quanta = np.array([steps.quantum for steps in channel.steps])[measured]
     for axis, quantum in zip(x.T, quanta, strict=True):
         off = np.abs(axis - np.median(axis))
@@ -66,7 +68,7 @@ def missing_rows(channel: Channel) -> MissingRows:
         near = np.mean((np.abs(x[rest]) <= np.maximum(NEAR_ZERO * size, 1.5 * quanta)).all(axis=1))
         if zeros.sum() >= FEWEST_MARKED and near <= 0.5 * np.mean(zeros):
             zero = zeros
-    return MissingRows(marked, zero, marker)
+    return MissingRows(marked, zero, frozen_rows(channel) & ~marked & ~zero, marker)
 
 
 def readings_of(channel: Channel) -> Channel:

@@ -42,7 +42,7 @@ def check_outliers(log: Log) -> Check:
         count = int(out.sum())
         facts[channel.name] = f"{count} of {len(out)} ({count / len(out):.2%})"
         if _added(channel, out) > WEIGHTY:
-            findings.append(_finding(channel, out))
+            findings.append(outlier_finding(channel, out))
     return Check("outliers", facts, tuple(findings), _panel(log, found))
 
 
@@ -54,7 +54,8 @@ def _added(channel: Channel, out: NDArray[np.bool_]) -> float:
     return float(np.max(added / channel.sigma**2))
 
 
-def _finding(channel: Channel, out: NDArray[np.bool_]) -> Finding:
+def outlier_finding(channel: Channel, out: NDArray[np.bool_]) -> Finding:
+    """Report the outliers of a channel, which are the rows `out` (n,)."""
     off = residuals(channel)
     spread = np.maximum(robust_sigma(off), rounding_sigma(channel))
     worst = np.abs(off[out]).max(axis=0)

@@ -9,7 +9,8 @@ from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Check, Finding
 from .channels import Channel, channels_of
-from .missing import FEWEST_MARKED, MissingRows, missing_rows
+from .frozen import frozen_findings
+from .missing import FEWEST_MARKED, missing_rows
 from .neighbours import FEWEST
 from .quantisation import Quantisation
 
@@ -44,16 +45,15 @@ def check_values(log: Log) -> Check:
         facts[channel.name] = _described(channel, x, steps)
         if len(x) < FEWEST:
             continue
-        dull, stuck = _stuck(channel, x, names)
+        dull, stuck = dead_axes(channel, x, names)
         findings += dull
         live = [k for k in range(len(measured)) if not stuck[k]]
         if not live:
             continue
         x, names, steps = x[:, live], [names[k] for k in live], [steps[k] for k in live]
         sigma = channel.sigma[measured][live]
-        found = missing_rows(channel)
-        findings += _missing(channel, found)
-        good = found.readings
+        findings += missing_findings(channel) + frozen_findings(log, channel)
+        good = missing_rows(channel).readings
         findings += _repeats(channel, x, good, steps)
         findings += _coarse(channel, x[good], names, steps, sigma)
         findings += _clipped(channel, x[good], names, steps)
@@ -71,7 +71,8 @@ def _described(channel: Channel, x: Array, steps: list[Quantisation]) -> str:
     return text + (f", {few} different values" if few <= FEW_VALUES and len(x) > FEW_VALUES else "")
 
 
-def _stuck(channel: Channel, x: Array, names: list[str]) -> tuple[list[Finding], list[bool]]:
+def dead_axes(channel: Channel, x: Array, names: list[str]) -> tuple[list[Finding], list[bool]]:
+    """Return what is wrong with the axes x (n, k) that never change, and which they are."""
     stuck = [bool(np.all(axis == axis[0])) for axis in x.T]
     path = f"streams.{channel.stream}"
     if all(stuck):
@@ -94,8 +95,9 @@ def _stuck(channel: Channel, x: Array, names: list[str]) -> tuple[list[Finding],
     return found, stuck
 
 
-def _missing(channel: Channel, missing: MissingRows) -> list[Finding]:
+def missing_findings(channel: Channel) -> list[Finding]:
     """Report the rows without a reading."""
+    missing = missing_rows(channel)
     path = f"streams.{channel.stream}"
     valid = f"{path}.valid: {{column: its validity, values: […]}}"
     found, size = [], np.linalg.norm(channel.raw[:, np.isfinite(channel.sigma)], axis=1)

@@ -15,6 +15,7 @@ import yaml
 from fathom.bench.inspection.findings.advice import resolved
 from fathom.bench.inspection.findings.finding import Finding
 from fathom.bench.inspection.gross.gross import gross_check, quick_findings
+from fathom.bench.inspection.gross.readings import reading_findings
 from fathom.bench.inspection.inspecting import inspect_log, open_to_inspect
 from fathom.datasets import Log, Scenario, open_log, simulate
 from fathom.datasets.described.description import read_description
@@ -282,3 +283,96 @@ def test_no_right_log_gives_an_alarm(mission: str, grade: str, seed: int) -> Non
 def test_recorded_logs_give_no_alarm(recorded_data: Path) -> None:
     names = [path.name for path in sorted(recorded_data.iterdir()) if path.is_dir()]
     assert {name: quick_findings(open_log(name, recorded_data)) for name in names} == dict.fromkeys(names, ())
+
+
+def rows(name: str, begin: int, end: int, value: Any) -> Callable[[Log], Log]:
+    """Rows of a stream, or of "gyro" or "accel", set to a value; None repeats the first of them."""
+
+    def of(log: Log) -> Log:
+        inertial = {"gyro": log.imu.w_WI_I, "accel": log.imu.f_I}
+        z = (inertial[name] if name in inertial else log.streams[name].z).copy()
+        z[begin:end] = z[begin] if value is None else value
+        if name in inertial:
+            return replace(log, imu=ImuStream(log.imu.t_ns, *{**inertial, name: z}.values()))
+        old: ReadingStream = getattr(log, name)
+        return replace(log, **{name: type(old)(old.t_ns, old.received_ns, z, old.sigma)})
+
+    return of
+
+
+def some(name: str, every: int, value: float) -> Callable[[Log], Log]:
+    """Every so many rows of a stream set to a value."""
+
+    def of(log: Log) -> Log:
+        old: ReadingStream = getattr(log, name)
+        z = old.z.copy()
+        z[::every] = value
+        return replace(log, **{name: type(old)(old.t_ns, old.received_ns, z, old.sigma)})
+
+    return of
+
+
+READINGS: dict[str, tuple[Callable[[Log], Log], str, str]] = {
+    "a mark in 4 %": (some("dvl", 25, -32.768), "dvl", "hold -32.768 m/s"),
+    "a mark of integers": (some("dvl", 25, -32768.0), "dvl", "hold -32768 m/s"),
+    "three marks": (rows("dvl", 100, 103, -32.768), "dvl", "3 rows of dvl"),
+    "zeros": (some("dvl", 10, 0.0), "dvl", "exactly zero on every axis"),
+    "a fix far off": (rows("gps", 30, 31, [1e3, 0.0, 0.0]), "gps", "stand out of their neighbours"),
+    "a gyro's spike": (rows("gyro", 4000, 4001, 30.0), "imu", "stand out of their neighbours"),
+    "a gyro of zeros": (imu(gyro=0.0), "imu", "gyro never changes"),
+    "a dead axis": (imu(gyro=np.diag([1.0, 1.0, 0.0])), "imu", "gyro z is 0 rad/s in every row"),
+    "a dead axis of the DVL": (stream("dvl", [1.0, 0.0, 1.0]), "dvl", "dvl y is 0 m/s in every row"),
+    "a dead DVL": (stream("dvl", 0.0), "dvl", "dvl never changes"),
+    "a dead depth sensor": (stream("depth", 0.0), "depth", "depth never changes"),
+    "a dead heading": (stream("heading", 0.0), "heading", "heading never changes"),
+    "a stuck gyro": (rows("gyro", 2000, 2500, None), "imu", "gyro is stuck from 80.0 to"),
+    "a gyro of zeros for 20 s": (rows("gyro", 2000, 2500, 0.0), "imu", "gyro is stuck from"),
+    "a stuck accelerometer": (rows("accel", 2000, 2500, None), "imu", "accel is stuck from 80.0 to"),
+    "a stuck DVL": (rows("dvl", 300, 400, None), "dvl", "dvl is stuck from"),
+    "a stuck heading": (rows("heading", 300, 400, None), "heading", "heading is stuck from"),
+    "a stuck depth sensor": (rows("depth", 600, 800, None), "depth", "depth is stuck from"),
+    "a stated sigma of a knot and more": (sigma("dvl", 500.0), "dvl", "its readings hardly count"),
+}
+
+
+@pytest.mark.parametrize("what", READINGS)
+def test_a_gross_reading_is_found_alone(what: str) -> None:
+    spoil, blamed, words = READINGS[what]
+    (finding,) = quick_findings(spoil(sail()))
+    assert finding.stream == blamed
+    assert words in finding.message
+    assert "every" not in finding.hint
+
+
+@pytest.mark.parametrize("what", ["a mark in 4 %", "a fix far off", "a stuck DVL", "a dead depth sensor"])
+def test_a_gross_reading_causes_no_second_finding(what: str) -> None:
+    spoil, blamed, words = READINGS[what]
+    (finding,) = inspect_log(spoil(sail())).findings
+    assert finding.stream == blamed
+    assert words in finding.message
+
+
+def at_rest(name: str, begin: int, end: int, step: float) -> Callable[[Log], Log]:
+    """A stream in steps, which stays at one of them between two rows and goes on from there without a leap."""
+
+    def of(log: Log) -> Log:
+        old: ReadingStream = getattr(log, name)
+        z = np.rint(old.z / step) * step
+        z[begin:end] = z[begin]
+        z[end:] += z[begin] - z[end]
+        return replace(log, **{name: type(old)(old.t_ns, old.received_ns, z, old.sigma)})
+
+    return of
+
+
+def test_what_may_rest_is_not_called_stuck() -> None:
+    log = sail()
+    assert log.dvl is not None
+    stopping = np.clip(np.abs(np.arange(len(log.dvl)) - 1000) / 50 - 2, 0.0, 1.0)
+    for still in (
+        at_rest("depth", 600, 800, 0.01),
+        at_rest("heading", 300, 400, 0.01),
+        stream("dvl", stopping[:, None]),
+        stream("dvl", [1.0, 0.0, 0.0]),
+    ):
+        assert not reading_findings(still(log))
