@@ -26,6 +26,7 @@ DEFAULTS = {"convention": "compass", "positive": "down", "axes": "FLU", "frame":
 """What a description means where it leaves one of these words out."""
 OTHER = {"compass": "yaw", "yaw": "compass", "down": "up", "up": "down", "FLU": "FRD", "FRD": "FLU"}
 OTHER |= {"ENU": "NED", "NED": "ENU"}
+OTHER |= {"quaternion_xyzw": "quaternion_wxyz", "quaternion_wxyz": "quaternion_xyzw"}
 QUANTITIES = {"gyro": d.Rate, "accel": d.Acceleration, "velocity": d.Speeds, "depth": d.Height, "heading": d.Angle}
 USUAL = {"gyro": "rad/s", "accel": "m/s^2", "velocity": "m/s", "depth": "m", "heading": "rad"}
 """The unit that a fix of another unit is relative to, or the other way round."""
@@ -36,6 +37,7 @@ IN_FILE = {
     "mirror latitude and longitude": "negate x and y",
     "mirror latitude": "negate y, which is north",
     "mirror longitude": "negate x, which is east",
+    "attitude.form": "a quaternion is x, y, z, w, in this order",
     "exchange": "exchange x and y",
 }
 """What to do in a truth's own file, by a word of the fix."""

@@ -14,6 +14,7 @@ from ....datasets.state import TimeArray
 from ..findings.advice import ATTITUDE, clock_fix
 from ..findings.finding import Check, Finding
 from ..streams.norms import NO_GRAVITY, check_norms
+from .attitudes import attitude_findings, random_heading
 from .axes import CLEARLY, SURELY, agreement, axes_findings, best, hypotheses, is_upright, scale_findings
 from .plane import heading_fits, heard_under_water, plane_findings
 from .relations import tilting, turning
@@ -81,6 +82,9 @@ def _times(sketch: Sketch) -> TimeArray:
 def _findings(sketch: Sketch) -> list[Finding]:
     if np.median(np.linalg.norm(sketch.f_I, axis=1)) < NO_GRAVITY * WEAKEST:
         return []  # there is no up
+    unread = [*attitude_findings(sketch), *random_heading(sketch)]
+    if unread:
+        return unread
     tilt = tilting(sketch)
     heading, truth = sketch.heading, sketch.truth_yaw
     by_heading = None if heading is None else turning(sketch, *heading)

@@ -119,6 +119,7 @@ FAULTS: dict[str, tuple[tuple[Callable[[Log], Log], ...], str, str]] = {
     "IMU's clock": ((imu(late_s=18.0),), "imu", "18.0 s late"),
     "compass for yaw": ((heading(lambda psi: np.pi / 2 - psi),), "heading", "compass"),
     "heading in radians": ((heading(lambda psi: np.radians(np.angle(np.exp(1j * psi)))),), "heading", "radians"),
+    "heading in degrees": ((heading(lambda psi: np.degrees(psi)),), "heading", "degrees are read as radians"),
     "heading late": ((stream("heading", late_s=18.0),), "heading", "18.0 s late"),
     "heading turned by 20°": ((turned("heading", 20.0),), "heading", "must be turned by -20"),
     "heading turned": ((turned("heading", 90.0),), "heading", "must be turned by -"),
@@ -309,6 +310,31 @@ def test_an_attitude_that_hardly_turns_is_not_told_as_a_heading_in_radians() -> 
     assert finding.stream == "heading"
     assert finding.fix == ""
     assert "form" in finding.hint
+
+
+def w_first(R: Array) -> Array:
+    """Attitudes (n, 3, 3) whose quaternions are written x, y, z, w and read w, x, y, z."""
+    return Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), -1, axis=1)).as_matrix()
+
+
+def test_quaternions_read_from_the_wrong_end_are_found() -> None:
+    log = sail()
+    assert log.truth is not None
+    (finding,) = quick_findings(replace(log, truth=replace(log.truth, R_WB=w_first(log.truth.R_WB))))
+    assert finding.stream == "truth"
+    assert finding.fix.startswith("truth.attitude.form: ")
+    R = w_first(log.truth.R_WB).reshape(-1, 9)
+    attitude = AttitudeStream(log.truth.t_ns, log.truth.t_ns, R, np.full((len(R), 3), 0.01))
+    (finding,) = quick_findings(replace(log, heading=attitude, truth=None))
+    assert finding.fix.startswith("streams.heading.attitude.form: ")
+
+
+def test_a_truth_in_other_axes_is_found() -> None:
+    log = sail()
+    assert log.truth is not None
+    (finding,) = quick_findings(replace(log, truth=replace(log.truth, R_WB=log.truth.R_WB * [1, -1, -1])))
+    assert finding.stream == "truth"
+    assert "is tilted by 17" in finding.message
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
