@@ -312,6 +312,14 @@ def test_an_attitude_that_hardly_turns_is_not_told_as_a_heading_in_radians() -> 
     assert "form" in finding.hint
 
 
+def test_zeros_of_a_dvl_blame_no_other_stream() -> None:
+    log = sail()
+    assert log.dvl is not None
+    z = np.where((np.arange(len(log.dvl)) % 50 < 10)[:, None], 0.0, log.dvl.z)
+    zeroed = replace(log, dvl=type(log.dvl)(log.dvl.t_ns, log.dvl.received_ns, z, log.dvl.sigma))
+    assert {finding.stream for finding in quick_findings(zeroed)} <= {"dvl"}
+
+
 def w_first(R: Array) -> Array:
     """Attitudes (n, 3, 3) whose quaternions are written x, y, z, w and read w, x, y, z."""
     return Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), -1, axis=1)).as_matrix()
