@@ -15,6 +15,8 @@ import yaml
 from fathom.bench.inspection.findings.advice import in_words, put, resolved
 from fathom.bench.inspection.findings.finding import Finding
 from fathom.bench.inspection.gross.gross import gross_check, quick_findings
+from fathom.bench.inspection.gross.sketch import sketch_of
+from fathom.bench.inspection.gross.vertical import climb_scale
 from fathom.bench.inspection.inspecting import inspect_log, open_to_inspect
 from fathom.datasets import Log, Scenario, open_log, simulate
 from fathom.datasets.described.description import read_description
@@ -318,6 +320,20 @@ def test_zeros_of_a_dvl_blame_no_other_stream() -> None:
     z = np.where((np.arange(len(log.dvl)) % 50 < 10)[:, None], 0.0, log.dvl.z)
     zeroed = replace(log, dvl=type(log.dvl)(log.dvl.t_ns, log.dvl.received_ns, z, log.dvl.sigma))
     assert {finding.stream for finding in quick_findings(zeroed)} <= {"dvl"}
+
+
+def test_a_stuck_piece_of_the_depth_is_no_scale() -> None:
+    log = sail()
+    assert log.depth is not None
+    rows = np.arange(len(log.depth))
+    first = int(np.argmin(np.gradient(np.convolve(log.depth.z[:, 0], np.ones(50) / 50, "same"))[50:-50])) + 50
+    stuck = (rows >= first) & (rows < first + len(rows) // 10)
+    z = np.where(stuck[:, None], log.depth.z[first], log.depth.z)
+    depth = type(log.depth)(log.depth.t_ns, log.depth.received_ns, z, log.depth.sigma)
+    sketch, as_it_was = (sketch_of(replace(log, depth=each)) for each in (depth, log.depth))
+    assert sketch is not None
+    assert as_it_was is not None
+    assert climb_scale(sketch) == pytest.approx(climb_scale(as_it_was), abs=0.01)
 
 
 def w_first(R: Array) -> Array:
