@@ -12,8 +12,6 @@ from typer.core import TyperCommand
 SOME_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit statuses; 130 is what shells report for a command that Ctrl-C ended (128 + SIGINT)."""
 
-"""Paths and values stay whole, to be copied."""
-
 
 class Verb(TyperCommand):
     """A command that reports what a user can correct, a line for each complaint. Bugs of ours keep their traceback."""

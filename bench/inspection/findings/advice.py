@@ -26,11 +26,23 @@ DEFAULTS = {"convention": "compass", "positive": "down", "axes": "FLU", "frame":
 """What a description means where it leaves one of these words out."""
 OTHER = {"compass": "yaw", "yaw": "compass", "down": "up", "up": "down", "FLU": "FRD", "FRD": "FLU"}
 OTHER |= {"ENU": "NED", "NED": "ENU"}
+OTHER |= {"quaternion_xyzw": "quaternion_wxyz", "quaternion_wxyz": "quaternion_xyzw"}
 QUANTITIES = {"gyro": d.Rate, "accel": d.Acceleration, "velocity": d.Speeds, "depth": d.Height, "heading": d.Angle}
 USUAL = {"gyro": "rad/s", "accel": "m/s^2", "velocity": "m/s", "depth": "m", "heading": "rad"}
 """The unit that a fix of another unit is relative to, or the other way round."""
 WORDS = re.compile(r": (mirror|exchange) ")
 """Fixes that stand for keys which only the description tells."""
+IN_FILE = {
+    "frame": "x is east, y north and z up; from north, east and down exchange x and y, and negate z",
+    "mirror latitude and longitude": "negate x and y",
+    "mirror latitude": "negate y, which is north",
+    "mirror longitude": "negate x, which is east",
+    "attitude.form": "a quaternion is x, y, z, w, in this order",
+    "exchange": "exchange x and y",
+}
+"""What to do in a truth's own file, by a word of the fix."""
+ATTITUDE = "streams.heading.attitude: check form, axes and world, the unit of angles, and the order of the columns"
+"""Instead of the keys of a heading."""
 Raw = dict[str, Any]
 Changes = dict[str, Any]
 """Values by their path in log.yaml."""
@@ -40,14 +52,33 @@ def resolved(finding: Finding, description: d.Description) -> Finding:
     """Return a finding whose fix holds absolute lines for a description; one that cannot be so becomes a hint."""
     if not finding.fix:
         return finding
-    lines = resolve(finding.fix, description.model_dump(mode="json", exclude_unset=True))
-    if lines is None and WORDS.search(finding.fix):
+    raw = description.model_dump(mode="json", exclude_unset=True)
+    words = in_words(finding.fix, raw)
+    lines = None if words else resolve(finding.fix, raw)
+    if lines is None and not words and WORDS.search(finding.fix):
         return replace(finding, fix="")  # the message says it
     if lines is None:
-        there = "in the truth's own file, which has no such key: " * finding.fix.startswith("truth.")
-        words = there + finding.fix.replace("\n", "; ")
+        words = words or finding.fix.replace("\n", "; ")
         return replace(finding, fix="", hint="; ".join(filter(None, (words, finding.hint))))
     return replace(finding, fix="\n".join(lines))
+
+
+def in_words(fix: str, raw: Raw) -> str:
+    """Return what to do in words where the keys of a fix are none of this description; else ""."""
+    truth, heading = _at(raw, "truth") or {}, _at(raw, "streams.heading") or {}
+    if fix.startswith("truth") and not {"table", "message"} & truth.keys():
+        said = next((words for key, words in IN_FILE.items() if key in fix), fix.replace("\n", "; "))
+        return f"in the truth's own file, since log.yaml has no key for it: {said}"
+    if "attitude" in heading and re.match(r"streams\.heading\.(heading|convention|add_deg)", fix):
+        return ATTITUDE
+    for name, key in (("latitude", "north_south"), ("longitude", "east_west")):
+        path = f"{fix.split(': ')[0]}.geodetic.{key}"
+        if ": mirror " in fix and name in fix and _at(raw, path) is not None:
+            return (
+                f"{path}: put the right letter into the column {_at(raw, path)}; or take the key away, and turn the "
+                f"sign with {path.removesuffix(key)}scale"
+            )
+    return ""
 
 
 def resolve(fix: str, raw: Raw) -> list[str] | None:

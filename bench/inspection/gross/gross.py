@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ....datasets.log import ImuStream, Log
+from ....datasets.log import AttitudeStream, ImuStream, Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import TimeArray
-from ..findings.advice import clock_fix
+from ..findings.advice import ATTITUDE, clock_fix
 from ..findings.finding import Check, Finding
 from ..streams.norms import NO_GRAVITY, check_norms
+from .attitudes import attitude_findings, random_heading
 from .axes import CLEARLY, SURELY, agreement, axes_findings, best, hypotheses, is_upright, scale_findings
 from .plane import heading_fits, heard_under_water, plane_findings
 from .readings import reading_findings, without
@@ -85,6 +86,9 @@ def _times(sketch: Sketch) -> TimeArray:
 def _findings(sketch: Sketch) -> list[Finding]:
     if np.median(np.linalg.norm(sketch.f_I, axis=1)) < NO_GRAVITY * WEAKEST:
         return []  # there is no up
+    unread = [*attitude_findings(sketch), *random_heading(sketch)]
+    if unread:
+        return unread
     tilt = tilting(sketch)
     heading, truth = sketch.heading, sketch.truth_yaw
     by_heading = None if heading is None else turning(sketch, *heading)
@@ -102,10 +106,12 @@ def _findings(sketch: Sketch) -> list[Finding]:
     in_plane, agrees = plane_findings(sketch, turns_right)
     suspects = {finding.stream for finding in in_plane}
     vouched = {"dvl"} if agrees else set()
-    every = [*in_plane, *vertical_findings(sketch, suspects, vouched)]
+    vertical = vertical_findings(sketch, suspects, vouched)
+    if not in_plane and all(finding.stream == "dvl" for finding in vertical):
+        vertical = _imu_yaw(sketch, agrees) or vertical  # it turns the climb over too
+    every = [*in_plane, *vertical]
     if not {"gps", "depth"} & {finding.stream for finding in every}:
         every += heard_under_water(sketch)
-    every += [] if every else _imu_yaw(sketch, agrees)
     keys = [(finding.stream, _key(finding)) for finding in every]
     return [finding for k, finding in enumerate(every) if keys[k] not in keys[:k]]
 
@@ -137,10 +143,11 @@ def _small_heading(sketch: Sketch) -> list[Finding]:
     heading = sketch.heading
     if heading is None or np.ptp(heading[1]) > 2.05 * np.pi * DEGREE or np.ptp(sketch.yaw) < 1.0:
         return []
-    message = (
-        f"The heading stays within {np.degrees(np.ptp(heading[1])):.1f}° while the gyro turns: radians are read as "
-        "degrees."
-    )
+    message = f"The heading stays within {np.degrees(np.ptp(heading[1])):.1f}° while the gyro turns: "
+    if isinstance(sketch.log.heading, AttitudeStream):
+        message += "its attitude is read in another form, or in another unit or order of columns, than it is in."
+        return [Finding("heading", message, hint=ATTITUDE)]
+    message += "radians are read as degrees."
     return [Finding("heading", message, "streams.heading.heading.unit: rad")]
 
 

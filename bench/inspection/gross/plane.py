@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from ....datasets.described.description import Speeds
+from ....datasets.described.geodesy import (
+    FLATTENING,
+    SEMI_MAJOR_M,
+    ecef_from_geodetic,
+    enu_axes,
+    geodetic_from_ecef,
+)
 from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
@@ -223,11 +231,45 @@ def _usable(course: Course, heard: Mask, fixes: Fixes) -> bool:
 
 
 def _far_away(log: Log, fixes: Fixes) -> Finding:
-    km = float(np.abs(np.median(fixes.p.real) + 1j * np.median(fixes.p.imag))) / 1e3
+    """Return what positions far from W's origin are: those of a sign or an order that brings them near it."""
+    p = complex(np.median(fixes.p.real), np.median(fixes.p.imag))
     who = "GPS" if fixes.stream == "gps" else f"The {log.truth_kind}"
-    return Finding(
-        fixes.stream, f"{who} lies {km:.0f} km from W's origin: latitude, longitude or a hemisphere is another's."
-    )
+    message = f"{who} lies {abs(p) / 1e3:.0f} km from W's origin"
+    meant = None if log.origin is None else _meant(p, np.radians(log.origin))
+    if meant is None:
+        return Finding(fixes.stream, message + ": latitude, longitude or a hemisphere is another's.")
+    swapped, signs = meant
+    path = _path_of(fixes)
+    if swapped:
+        message += ", and near it with latitude and longitude exchanged: the two columns are swapped."
+        return Finding(fixes.stream, message, f"{path}.geodetic: exchange latitude and longitude")
+    names = [name for name, sign in zip(("latitude", "longitude"), signs, strict=True) if sign < 0]
+    message += f", and near it with the sign of {' and '.join(names)} turned: a hemisphere (S or W) is missing there, "
+    message += "or in the origin."
+    return Finding(fixes.stream, message, f"{path}: mirror {' and '.join(names)}")
+
+
+def _meant(p: complex, origin: Array) -> tuple[bool, tuple[int, int]] | None:
+    """Return whether to exchange latitude and longitude, and their signs then, for p (east + i north) to be near.
+
+    Args:
+        p: a position in the plane tangent at the origin, m, of a place on the ellipsoid.
+        origin: (2,) latitude and longitude, rad.
+    """
+    at, axes = ecef_from_geodetic(origin[:1], origin[1:], np.zeros(1))[0], enu_axes(origin[:1], origin[1:])[0]
+    round_ = np.array([1.0, 1.0, 1 / (1 - FLATTENING)])  # makes a sphere of the ellipsoid
+    start, up = (at + p.real * axes[0] + p.imag * axes[1]) * round_, axes[2] * round_
+    roots = np.roots([up @ up, 2 * start @ up, start @ start - SEMI_MAJOR_M**2])
+    if np.iscomplex(roots).any():
+        return None
+    latitude, longitude, _ = geodetic_from_ecef((start + roots[:, None] * up) / round_)
+    for swapped, signs in product((False, True), ((1, 1), (-1, 1), (1, -1), (-1, -1))):
+        read = np.stack([longitude, latitude] if swapped else [latitude, longitude])
+        off = read * np.array(signs)[:, None] - origin[:, None]
+        off[1] = np.angle(np.exp(1j * off[1])) * np.cos(origin[0])
+        if (swapped or min(signs) < 0) and (np.linalg.norm(off, axis=0) * SEMI_MAJOR_M < FAR_M).any():
+            return swapped, signs
+    return None
 
 
 def _of_fixes(
@@ -421,6 +463,7 @@ def _clock(sketch: Sketch, course: Course, path: list[Plane], fixes: Fixes, now:
         f"{now.rms_m:.3g} m now."
     )
     if stream == "gps" and abs(abs(late_s) - LEAP_S) < 1:
+        late_s = float(np.copysign(LEAP_S, late_s))
         message += f" GPS time and UTC differ by {LEAP_S} leap seconds."
     return Finding(stream, message, clock_fix(stream, late_s))
 

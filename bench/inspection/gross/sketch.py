@@ -79,7 +79,8 @@ class Sketch:
     def velocity(self) -> tuple[Array, Mask] | None:
         """v_WB_B (n, 3) m/s by the DVL, unmeasured axes as zero, and where it is heard (n,); None without.
 
-        Rows far faster than usual hold no reading. A DVL of which an axis never changes counts as absent.
+        Rows far faster than usual, and zeros amid way, hold no reading. A DVL of which an axis never changes counts as
+        absent.
         """
         dvl = self.log.dvl
         if dvl is None or len(dvl) < 30:
@@ -87,6 +88,9 @@ class Sketch:
         known = np.isfinite(dvl.sigma).any(axis=0)
         speed = np.linalg.norm(dvl.z * known, axis=1)
         good = speed < FASTER * np.median(speed) + SLOW_M_S
+        moved = np.flatnonzero(speed > 0)
+        if len(moved):
+            good &= (speed > 0) | (np.interp(np.arange(len(speed)), moved, speed[moved]) < SLOW_M_S)
         stuck = (dvl.z == dvl.z[0]).all(axis=0) & (dvl.z[0] != 0)
         if np.count_nonzero(good) < 30 or (stuck & known).any():
             return None

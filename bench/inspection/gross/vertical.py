@@ -44,8 +44,10 @@ def _heights(sketch: Sketch) -> dict[str, tuple[Array, Mask]]:
     """Return the heights that there are on the grid (n,), m, and where each is heard (n,): dvl, depth, truth."""
     log, found = sketch.log, {}
     if log.depth is not None and len(log.depth) >= 30:
-        t_s = seconds(log, log.depth.t_ns)
-        found["depth"] = sketch.on_grid(t_s, log.depth.z[:, 0]), sketch.heard(t_s)
+        t_s, z = seconds(log, log.depth.t_ns), log.depth.z[:, 0]
+        fresh = np.diff(z, prepend=np.nan) != 0  # a stuck piece is then a gap
+        fresh = fresh if np.count_nonzero(fresh) >= 30 else np.full(len(z), True)
+        found["depth"] = sketch.on_grid(t_s[fresh], z[fresh]), sketch.heard(t_s[fresh])
     motion = sketch.velocity
     if motion is not None and log.dvl is not None and np.isfinite(log.dvl.sigma).any(axis=0).all():
         climb = sketch.level_velocity(motion[0])[1]

@@ -12,19 +12,22 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from fathom.bench.inspection.findings.advice import resolved
+from fathom.bench.inspection.findings.advice import in_words, put, resolved
 from fathom.bench.inspection.findings.finding import Finding
 from fathom.bench.inspection.gross.gross import gross_check, quick_findings
 from fathom.bench.inspection.gross.readings import reading_findings
+from fathom.bench.inspection.gross.sketch import sketch_of
+from fathom.bench.inspection.gross.vertical import climb_scale
 from fathom.bench.inspection.inspecting import inspect_log, open_to_inspect
 from fathom.datasets import Log, Scenario, open_log, simulate
 from fathom.datasets.described.description import read_description
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.described.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from fathom.datasets.log import HeadingStream, ImuStream, ReadingStream
+from fathom.datasets.log import AttitudeStream, HeadingStream, ImuStream, ReadingStream
 from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.missions import MISSIONS
 from fathom.datasets.state import Array
+from scipy.spatial.transform import Rotation
 
 PORTO = (41.185, -8.706)
 SWAPPED_YZ = np.diag([1.0, -1.0, -1.0])
@@ -114,10 +117,12 @@ FAULTS: dict[str, tuple[tuple[Callable[[Log], Log], ...], str, str]] = {
     "IMU FRD": ((imu(SWAPPED_YZ, SWAPPED_YZ),), "imu", "points down in the body"),
     "gyro's columns exchanged": ((imu(np.eye(3)[[1, 0, 2]]),), "imu", "must be read as (y, x, z)"),
     "IMU turned by 90°": ((imu(*2 * [np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])]),), "imu", "yaw on the vehicle"),
+    "IMU turned by 180°": ((imu(*2 * [np.diag([-1.0, -1.0, 1.0])]),), "imu", "yaw on the vehicle"),
     "gyro of 0.6 alone": ((imu(gyro=0.6), without("heading", "truth")), "imu", "scale is off"),
     "IMU's clock": ((imu(late_s=18.0),), "imu", "18.0 s late"),
     "compass for yaw": ((heading(lambda psi: np.pi / 2 - psi),), "heading", "compass"),
     "heading in radians": ((heading(lambda psi: np.radians(np.angle(np.exp(1j * psi)))),), "heading", "radians"),
+    "heading in degrees": ((heading(lambda psi: np.degrees(psi)),), "heading", "degrees are read as radians"),
     "heading late": ((stream("heading", late_s=18.0),), "heading", "18.0 s late"),
     "heading turned by 20°": ((turned("heading", 20.0),), "heading", "must be turned by -20"),
     "heading turned": ((turned("heading", 90.0),), "heading", "must be turned by -"),
@@ -214,7 +219,7 @@ def test_a_truth_that_is_grossly_wrong_is_found(what: str) -> None:
     assert words in finding.message
 
 
-def geodetic(folder: Path, log: Log, **columns: str) -> Path:
+def geodetic(folder: Path, log: Log, **columns: Any) -> Path:
     """Write a log with fixes as latitude and longitude, read from the columns given."""
     write_folder(replace(log, truth=None), folder)
     assert log.gps is not None
@@ -244,6 +249,117 @@ def test_a_lost_hemisphere_is_found_and_no_compass_blamed(tmp_path: Path) -> Non
     (finding,) = found_in(geodetic(tmp_path / "log", sail(), longitude="west"))
     assert finding.stream == "gps"
     assert "hemisphere W" in finding.message
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [{"longitude": "west"}, {"scale": [-1, 1]}, {"scale": [-1, -1]}, {"latitude": "lon", "longitude": "lat"}],
+)
+def test_fixes_far_from_a_stated_origin_are_brought_near_by_signs_or_order(
+    columns: dict[str, Any], tmp_path: Path
+) -> None:
+    folder = geodetic(tmp_path / "log", sail(), **columns)
+    raw = yaml.safe_load((folder / "log.yaml").read_text())
+    raw["origin"] = {"latitude_deg": PORTO[0], "longitude_deg": PORTO[1]}
+    (folder / "log.yaml").write_text(yaml.safe_dump(raw))
+    (finding,) = found_in(folder)
+    assert "km from W's origin, and near it with" in finding.message
+    apply(folder, finding)
+    assert found_in(folder) == ()
+
+
+def test_fixes_that_no_sign_brings_near_are_only_told(tmp_path: Path) -> None:
+    folder = geodetic(tmp_path / "log", sail())
+    raw = yaml.safe_load((folder / "log.yaml").read_text())
+    raw["origin"] = {"latitude_deg": 10.0, "longitude_deg": 20.0}
+    (folder / "log.yaml").write_text(yaml.safe_dump(raw))
+    (finding,) = found_in(folder)
+    assert finding.fix == ""
+    assert "another's" in finding.message
+
+
+def test_leap_seconds_are_advised_exactly(tmp_path: Path) -> None:
+    (finding,) = found_in(write_folder(marred("GPS late"), tmp_path / "log"))
+    assert finding.fix == "streams.gps.time.clock_offset_s: -18"
+
+
+TUM = {"truth": {"tum": "truth.tum"}}
+HEMISPHERES = {"latitude": "lat", "longitude": "lon", "north_south": "ns"}
+
+
+@pytest.mark.parametrize(
+    ("fix", "there", "hint"),
+    [
+        ("truth.frame: NED  # or ENU, whichever it is not", TUM, "exchange x and y, and negate z"),
+        ("truth: mirror latitude", TUM, "negate y"),
+        ("streams.heading.heading.unit: rad", {"streams.heading.attitude.form": "matrix"}, "form, axes and world"),
+        ("streams.gps: mirror latitude", {"streams.gps.geodetic": HEMISPHERES}, "the right letter into the column ns"),
+    ],
+)
+def test_advice_for_a_key_that_is_none_of_the_log_is_in_words(fix: str, there: dict[str, Any], hint: str) -> None:
+    raw: dict[str, Any] = {}
+    for path, value in there.items():
+        put(raw, path, value)
+    assert hint in in_words(fix, raw)
+
+
+def test_an_attitude_that_hardly_turns_is_not_told_as_a_heading_in_radians() -> None:
+    log = sail()
+    assert log.heading is not None
+    psi = np.radians(np.angle(np.exp(1j * log.heading.z[:, 0])))
+    R = Rotation.from_rotvec(np.outer(psi, [0, 0, 1])).as_matrix().reshape(-1, 9)
+    attitude = AttitudeStream(log.heading.t_ns, log.heading.received_ns, R, np.full((len(R), 3), 0.01))
+    (finding,) = quick_findings(replace(log, heading=attitude, truth=None))
+    assert finding.stream == "heading"
+    assert finding.fix == ""
+    assert "form" in finding.hint
+
+
+def test_zeros_of_a_dvl_blame_no_other_stream() -> None:
+    log = sail()
+    assert log.dvl is not None
+    z = np.where((np.arange(len(log.dvl)) % 50 < 10)[:, None], 0.0, log.dvl.z)
+    zeroed = replace(log, dvl=type(log.dvl)(log.dvl.t_ns, log.dvl.received_ns, z, log.dvl.sigma))
+    assert {finding.stream for finding in quick_findings(zeroed)} <= {"dvl"}
+
+
+def test_a_stuck_piece_of_the_depth_is_no_scale() -> None:
+    log = sail()
+    assert log.depth is not None
+    rows = np.arange(len(log.depth))
+    first = int(np.argmin(np.gradient(np.convolve(log.depth.z[:, 0], np.ones(50) / 50, "same"))[50:-50])) + 50
+    stuck = (rows >= first) & (rows < first + len(rows) // 10)
+    z = np.where(stuck[:, None], log.depth.z[first], log.depth.z)
+    depth = type(log.depth)(log.depth.t_ns, log.depth.received_ns, z, log.depth.sigma)
+    sketch, as_it_was = (sketch_of(replace(log, depth=each)) for each in (depth, log.depth))
+    assert sketch is not None
+    assert as_it_was is not None
+    assert climb_scale(sketch) == pytest.approx(climb_scale(as_it_was), abs=0.01)
+
+
+def w_first(R: Array) -> Array:
+    """Attitudes (n, 3, 3) whose quaternions are written x, y, z, w and read w, x, y, z."""
+    return Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), -1, axis=1)).as_matrix()
+
+
+def test_quaternions_read_from_the_wrong_end_are_found() -> None:
+    log = sail()
+    assert log.truth is not None
+    (finding,) = quick_findings(replace(log, truth=replace(log.truth, R_WB=w_first(log.truth.R_WB))))
+    assert finding.stream == "truth"
+    assert finding.fix.startswith("truth.attitude.form: ")
+    R = w_first(log.truth.R_WB).reshape(-1, 9)
+    attitude = AttitudeStream(log.truth.t_ns, log.truth.t_ns, R, np.full((len(R), 3), 0.01))
+    (finding,) = quick_findings(replace(log, heading=attitude, truth=None))
+    assert finding.fix.startswith("streams.heading.attitude.form: ")
+
+
+def test_a_truth_in_other_axes_is_found() -> None:
+    log = sail()
+    assert log.truth is not None
+    (finding,) = quick_findings(replace(log, truth=replace(log.truth, R_WB=log.truth.R_WB * [1, -1, -1])))
+    assert finding.stream == "truth"
+    assert "is tilted by 17" in finding.message
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
