@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import sys
 from pathlib import Path
 
@@ -25,7 +23,7 @@ def test_on_a_terminal_lines_are_folded_between_words(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    monkeypatch.setattr(shutil, "get_terminal_size", lambda: os.terminal_size((30, 20)))
+    monkeypatch.setenv("COLUMNS", "30")
     with pytest.raises(typer.Exit):
         refuse("a-b/log.yaml: unknown key `streems`; did you mean 'streams'?\na-b/log.yaml: missing key `streams`")
     lines = capsys.readouterr().err.splitlines()
