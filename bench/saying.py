@@ -19,7 +19,7 @@ def say(message: str) -> None:
 
         width = Console(stderr=True).width
     for line in message.splitlines():
-        text = shown(line)
+        text = shown(line.rstrip())
         print(text if width is None else folded(text, width), file=sys.stderr, flush=True)
 
 

@@ -38,7 +38,7 @@ def frozen_rows(channel: Channel) -> NDArray[np.bool_]:
     if len(x) < 4 * LONG_ROWS or not x.shape[1]:
         return frozen
     change = np.abs(np.diff(x, axis=0))
-    same = (change <= (SAME_ANGLE if channel.stream == "heading" else 0.0)).all(axis=1)
+    same = np.all(change <= (SAME_ANGLE if channel.stream == "heading" else 0.0), axis=1)
     if np.count_nonzero(same) < LONG_ROWS:
         return frozen
     pieces = [
