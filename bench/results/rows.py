@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 import pandas as pd
 
+from ...datasets.notes import KINDS
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.scoring import COSTS, INNOVATIONS, SCORES
 from .step_time import EDGES_NS
@@ -180,7 +181,24 @@ def _has_scores(value: Any) -> bool:
 
 
 def _has_notes(value: Any) -> bool:
-    return isinstance(value, list)
+    return isinstance(value, list) and all(map(_is_note, value))
+
+
+def _is_note(value: Any) -> bool:
+    numbers = ("count", "of", "share", "seconds")
+    return (
+        isinstance(value, dict)
+        and value.get("kind") in KINDS
+        and all(isinstance(value.get(name, ""), str) for name in ("text", "stream"))
+        and all(_is_number(value[name]) for name in numbers if name in value)
+        and "text" in value
+    )
+
+
+def _has_reasons(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in value.values()
+    )
 
 
 def _is_mapping(value: Any) -> bool:
@@ -207,6 +225,7 @@ PARTS: dict[str, Callable[[Any], bool]] = {
     "spec": _has_scores,
     "counts": _has_counts,
     "notes": _has_notes,
+    "missing": _has_reasons,
     "versions": _is_mapping,
     "machine": _is_mapping,
 }

@@ -25,7 +25,7 @@ ROW: dict[str, Any] = {
     **{"ate_rmse_m": 1.5, "n_scored": 10.0, "lookahead_s": 0.0, "truth_kind": "truth", "align": "none", "dims": "3d"},
     **{"identity": "a1b2c3d4", "step_max_us": 9.0, "nis_depth": 1.0, "commit_id": "c", "real_time_factor": 100.0},
     **{"nees_at": json.dumps(NEES), "nis_dof": '{"depth": 8}', "step_histogram": '{"100": 3}', "counts": '{"late": 1}'},
-    **{"notes": '["n"]', "versions": '{"python": "3"}', "machine": '{"cpu": "x"}'},
+    **{"notes": '[{"kind": "about", "text": "n"}]', "versions": '{"python": "3"}', "machine": '{"cpu": "x"}'},
 }
 
 
@@ -57,6 +57,9 @@ DAMAGES: list[tuple[str, Any]] = [
     ("spec", "[]"),
     ("spec", '{"scores": "all"}'),
     ("notes", '"a text"'),
+    ("notes", '["a text"]'),
+    ("notes", '[{"kind": "unheard of", "text": "t"}]'),
+    ("missing", '{"why": "ate"}'),
     ("versions", "numpy 2"),
     ("machine", "[" * 100_000),
     ("ate_rmse_m", "text"),
