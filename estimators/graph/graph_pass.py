@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -39,8 +39,11 @@ from .gtsam_border import (
     reading_factor,
     tight_displacement_factor,
 )
+from .imu_factor import imu_factor
 from .losses import distance, rows, with_loss
 from .solvers import Solver
+
+ImuFactor = Literal["gtsam", "fathom"]
 
 
 @dataclass
@@ -67,8 +70,10 @@ class Keyframe:
 class GraphPass:
     """One pass of a smoother on GTSAM."""
 
-    def __init__(self, config: GraphSmoother, solver: Solver, prior: Belief, rig: Rig) -> None:
-        self._config = config
+    def __init__(
+        self, config: GraphSmoother, solver: Solver, prior: Belief, rig: Rig, imu_factor: ImuFactor = "gtsam"
+    ) -> None:
+        self._config, self._imu_factor = config, imu_factor
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._R_BI = rig.imu.R_BS
         self._losses: list[Loss | None] = [config.robust.get(sensor) for sensor in SENSOR]
@@ -164,8 +169,11 @@ class GraphPass:
         last.next_ns = t_ns
         i, j = last.index, last.index + 1
         record, block = self._block(last, self._newest, t_ns)
-        preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig, record[0]["p_WB_W"])
-        self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
+        if self._imu_factor == "fathom":
+            self._graph.add(imu_factor(i, j, block, record[0]["R_WB"], self._rig))
+        else:
+            preintegrated = preintegrate_imu(last.imu, last.before, block, self._rig, record[0]["p_WB_W"])
+            self._graph.add(gtsam.CombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), preintegrated))
         self._window.append(Keyframe(j, t_ns, last.imu[-1:], rest))
         self._predicted = self._predict(record, block, t_ns)
 

@@ -148,7 +148,7 @@ def preintegrate_imu(
 
 
 @inner
-def _fill_state(pose: Array, v_WB_W: Array, bias: Array, R_BI: Array, state: NDArray[Any]) -> None:
+def fill_state(pose: Array, v_WB_W: Array, bias: Array, R_BI: Array, state: NDArray[Any]) -> None:
     """Fill a STATE record, but for P, from GTSAM's pose (4, 4), velocity and bias (6,)."""
     s = state[0]
     for i in range(3):
@@ -160,7 +160,7 @@ def _fill_state(pose: Array, v_WB_W: Array, bias: Array, R_BI: Array, state: NDA
 
 
 @compiled
-def _by_gtsam(n: int, H: Array, pose: Array, R_BI: Array) -> tuple[Array, Array, Array]:
+def by_gtsam(n: int, H: Array, pose: Array, R_BI: Array) -> tuple[Array, Array, Array]:
     """Split n rows of a Jacobian by our error state into those by GTSAM's pose, velocity and bias."""
     H_x, H_v, H_b = np.zeros((n, 6)), np.empty((n, 3)), np.zeros((n, 6))
     for i in range(n):
@@ -186,13 +186,13 @@ def _linearise(
     """Residual of a reading, carried over `block` first, and its Jacobians by the pose, velocity and bias of i."""
     state, R_BI = np.empty(1, STATE), rig[0].R_BI[:]
     r, H, H_i, C, F = np.empty(3), np.empty((3, DIM)), np.empty((3, DIM)), np.empty((3, 3)), np.empty((DIM, DIM))
-    _fill_state(pose, v_WB_W, bias, R_BI, state)
+    fill_state(pose, v_WB_W, bias, R_BI, state)
     identity(F)
     if carried:
         predict(block, state, rig[0].gravity, F, state)
     n = measure(reading, TOP, state, rig, r, H, C)
     rows_times(n, H, F, H_i)
-    H_x, H_v, H_b = _by_gtsam(n, H_i, pose, R_BI)
+    H_x, H_v, H_b = by_gtsam(n, H_i, pose, R_BI)
     return r[:n].copy(), H_x, H_v, H_b
 
 
@@ -307,7 +307,7 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
     identity(R_BI)  # biases are not involved
     (R_i, p_i), (_, p_j) = _split_pose(pose_i), _split_pose(pose_j)
     r = preintegrated_dvl_residual(R_i, p_i, p_j, dp_ij, H_i, H_j)
-    return r, _by_gtsam(len(H_i), H_i, pose_i, R_BI)[0], _by_gtsam(len(H_j), H_j, pose_j, R_BI)[0]
+    return r, by_gtsam(len(H_i), H_i, pose_i, R_BI)[0], by_gtsam(len(H_j), H_j, pose_j, R_BI)[0]
 
 
 @stage("linearisation")
@@ -336,8 +336,8 @@ def _linearise_tight_displacement(
         for j in range(3):
             b_g[i] += R_BI[j, i] * bias[OF_GYRO + j]
     r = tight_dvl_residual(R_i, p_i, b_g, R_j, p_j, displacement, K, H_i, H_j)
-    H_x, _, H_b = _by_gtsam(len(H_i), H_i, pose_i, R_BI)
-    return r, H_x, _by_gtsam(len(H_j), H_j, pose_j, R_BI)[0], H_b
+    H_x, _, H_b = by_gtsam(len(H_i), H_i, pose_i, R_BI)
+    return r, H_x, by_gtsam(len(H_j), H_j, pose_j, R_BI)[0], H_b
 
 
 @stage("linearisation")
@@ -370,12 +370,12 @@ def _linearise_prior(
 ) -> tuple[Array, Array, Array, Array]:
     """Return r (15,) = state ⊖ mean, and its Jacobians by the pose, velocity and bias."""
     r, H, J, state = np.empty(DIM), np.empty((DIM, DIM)), np.empty((3, 3)), np.empty(1, STATE)
-    _fill_state(pose, v_WB_W, bias, R_BI, state)
+    fill_state(pose, v_WB_W, bias, R_BI, state)
     local(mean, state, r)
     identity(H)
     inverse_right_jacobian_into(r[THETA], J)
     set_block(H, THETA_0, THETA_0, 1.0, J)
-    H_x, H_v, H_b = _by_gtsam(len(H), H, pose, R_BI)
+    H_x, H_v, H_b = by_gtsam(len(H), H, pose, R_BI)
     return r, H_x, H_v, H_b
 
 
