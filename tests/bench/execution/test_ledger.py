@@ -270,15 +270,15 @@ for k in range(kills):
         sweep.run_experiment(plan, out=out, jobs=2)
         os._exit(0)
     if longest_s is None:  # how long is a moment on this machine, as busy as it is
-        while len(held()) < 6:
+        while len(held()) < 2:
             time.sleep(0.01)
         longest_s = time.monotonic() - begun
-    elif k % 2:  # while it starts, or later
+    elif k % 2:  # while it starts, or a little later
         time.sleep(moments.uniform(0.0, longest_s))
     else:  # while it runs: a moment after one more run has ended
-        while len(held()) == before:
+        while len(held()) == before and len(held()) < len(plan.runs()):
             time.sleep(0.002)
-        time.sleep(moments.uniform(0.0, longest_s / 6))
+        time.sleep(moments.uniform(0.0, 0.05))
     os.killpg(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     print(json.dumps([os.waitstatus_to_exitcode(status), held()]), flush=True)
