@@ -89,11 +89,8 @@ def check_smoothed(smoothed: Trajectory, ticks_ns: TimeArray, given_ns: TimeArra
             f"finish(): {n} of {len(given_ns)} ticks; it must return the states at all times at which a belief was "
             f"asked for, the first without one is {given_ns[lacking[0]]} ns"
         )
-    if not isinstance(smoothed.lookahead_s, int | float) or not smoothed.lookahead_s > 0:
-        raise ValueError(
-            f"finish(): lookahead_s must be seconds, more than 0, found {smoothed.lookahead_s!r:.60}; a filter, which "
-            "has seen nothing of the future, returns None"
-        )
+    if not isinstance(smoothed.lookahead_s, int | float) or not smoothed.lookahead_s >= 0:
+        raise ValueError(f"finish(): lookahead_s must be seconds, 0 or more, found {smoothed.lookahead_s!r:.60}")
 
 
 def check_counts(counts: Mapping[str, int]) -> None:

@@ -116,7 +116,7 @@ def whole_spec(spec: str | None, seed: int | None) -> str | None:
     """Return the spec of a row of `read_rows` with its seed, as JSON; None where the row has no spec."""
     if not spec or spec == "{}":
         return spec
-    return json.dumps(json.loads(spec) | {"seed": seed})
+    return json.dumps({"seed": seed} | json.loads(spec))  # a spec of another seed keeps it
 
 
 # -- rows that cannot be read -----------------------------------------------------------------------------------------

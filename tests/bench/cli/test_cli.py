@@ -74,7 +74,7 @@ def test_a_recording_that_is_not_here_is_reported_plainly(tmp_path: Path) -> Non
     file = write(tmp_path, logs=logs, estimators="[{name: dead-reckoning}]")
     code, out, _ = call("run", file, "--out", tmp_path, "--data", tmp_path, "--jobs", 1)
     assert code == 0
-    assert out.splitlines()[-1].startswith("ictineu_stpere_2004: not here: no folder")
+    assert "ictineu_stpere_2004: not here: no folder" in " ".join(out.split())
     code, out, _ = call("run", file, "--out", tmp_path, "--data", tmp_path, "--only", "ictineu*")
     assert code == 2
 
@@ -85,7 +85,7 @@ def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(
     code, out, _ = call(*run, "--data", tmp_path)
     assert code == 2
     assert out.startswith("ictineu_stpere_2004: not here: no folder")
-    assert out.count("\n") == 1
+    assert " ".join(out.split()).count("not here") == 1
     assert not (tmp_path / "short" / "report.html").exists()
     with closing(sqlite3.connect(tmp_path / "short" / "runs.sqlite")) as store, store:
         store.execute("UPDATE runs SET status = 'done', ate_rmse_m = 1.5, n_scored = 9")
