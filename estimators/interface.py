@@ -40,6 +40,9 @@ Inflation = Annotated[dict[str, Positive], sensors_among(FACTORS | {"gyro", "acc
 Gate = Annotated[dict[str, Annotated[Number, Field(gt=0, lt=1)]], sensors_among(FACTORS)]
 """Probability by sensor: a reading is left out if its NIS exceeds the chi-square quantile of this probability."""
 
+OUTLIERS = "outliers_"
+"""Prefix, before the sensor's name, of the counts of readings left out by a gate, or given less weight by a loss."""
+
 
 def unknown_kind(kind: int) -> ValueError:
     """Return the error for a reading of a kind that no sensor of ours has."""

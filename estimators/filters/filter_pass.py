@@ -21,7 +21,7 @@ from ...datasets.quantities import NotNegative, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ...datasets.trajectory import Trajectory
-from ..interface import FACTORS, Diverged, Factors, Gate, Inflation
+from ..interface import FACTORS, OUTLIERS, Diverged, Factors, Gate, Inflation
 from ..physics.imu import BLOCK, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
@@ -111,7 +111,7 @@ class FilterPass:
         kalman: Kalman,
         on_epoch: Callable[[Epoch, NDArray[Any], NDArray[Any]], None] | None = None,
     ) -> None:
-        self.counts: Counter[str] = Counter({f"outliers_{sensor}": 0 for sensor in config.gate})
+        self.counts: Counter[str] = Counter({OUTLIERS + sensor: 0 for sensor in config.gate})
         self._config = config
         self._predict = staged("propagation", kalman.predict)
         self._correct = staged("solve", kalman.correct)
@@ -200,7 +200,7 @@ class FilterPass:
         beyond = table["nis"] > widths[readings["kind"], table["dof"]]
         if not beyond.any():
             return readings
-        outliers.update(f"outliers_{SENSOR[kind]}" for kind in readings["kind"][beyond].tolist())
+        outliers.update(OUTLIERS + SENSOR[kind] for kind in readings["kind"][beyond].tolist())
         return readings[~beyond]
 
     def _replay(self, epoch: Epoch) -> Epoch:

@@ -21,7 +21,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import DIM, Belief, NavState
 from ...datasets.trajectory import Trajectory
 from ..between_keyframes import carry_on
-from ..interface import Diverged
+from ..interface import OUTLIERS, Diverged
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, SOLVE, SUMMED, Keyframes
 from ..physics.dvl_preintegration import preintegrate_dvl
 from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict, split
@@ -298,4 +298,4 @@ class GraphPass:
             for i in {gtsam.Symbol(key).index() for key in factor.keys()}:  # noqa: SIM118 - a factor is no dict
                 if not values.exists(X(i)):
                     insert_state(values, i, self._solver.state(i), self._R_BI)
-            self._outliers[f"outliers_{sensor}"] += int(distance(factor, values) > limit)
+            self._outliers[OUTLIERS + sensor] += int(distance(factor, values) > limit)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import gtsam
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
+from ...datasets.errors import message_of
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged, unknown_kind
 from ..physics.blocks import TOP, identity, rows_times, set_block
@@ -39,8 +40,10 @@ from ..physics.so3 import (
     transform_into,
 )
 from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, THETA_0, VELOCITY_0, local
-from ..stages import stage
+from ..stages import stage, staged
 
+Linearised: TypeAlias = tuple[Array, ...]
+"""A residual (k,) and its Jacobians (k, 3 or 6) by the variables of a factor, in GTSAM's tangents."""
 OF_PLACE: Any = np.int64(3)
 """Where the translation begins in GTSAM's pose tangent: (rotation, translation)."""
 OF_GYRO: Any = np.int64(3)
@@ -214,6 +217,39 @@ def _carried_covariance(reading: NDArray[Any], block: NDArray[Any], state: NDArr
     return cov
 
 
+def _pose(values: gtsam.Values, key: int) -> Array:
+    return values.atPose3(key).matrix()
+
+
+def _bias(values: gtsam.Values, key: int) -> Array:
+    return values.atConstantBias(key).vector()
+
+
+READ: dict[str, Callable[[gtsam.Values, int], Array]] = {"x": _pose, "v": gtsam.Values.atVector, "b": _bias}
+"""How a variable is read from GTSAM's values, by the letter of its key: pose (4, 4), velocity (3,), bias (6,)."""
+
+
+def custom_factor(model: Any, keys: list[int], linearise: Callable[..., Linearised]) -> gtsam.CustomFactor:
+    """Return a factor of ours on these keys.
+
+    Args:
+        model: GTSAM's noise model.
+        keys: of poses, velocities and biases.
+        linearise: given what `READ` has of each key, returns the residual and its Jacobians, one for each key; further
+            ones are left out.
+    """
+    variables = [(READ[gtsam.Symbol(key).string()[0]], key) for key in keys]
+
+    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
+        r, *H = linearise(*[read(values, key) for read, key in variables])
+        if jacobians is not None:
+            for k in range(len(keys)):
+                jacobians[k] = H[k]
+        return r
+
+    return gtsam.CustomFactor(model, keys, staged("linearisation", callback))
+
+
 @stage("linearisation")
 def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.NonlinearFactor:
     """Return the factor of a reading that was true at keyframe i: GTSAM's own where it has one.
@@ -239,27 +275,15 @@ def reading_factor(i: int, reading: NDArray[Any], rig: NDArray[Any]) -> gtsam.No
         R_WB = row["z"].reshape(3, 3) @ g["R_BH"].T
         return gtsam.PoseRotationPrior3D(X(i), gtsam.Rot3(R_WB), gtsam.noiseModel.Diagonal.Sigmas(sigma))
 
-    @stage("linearisation")
-    def pose_callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        r, H_x, _, _ = _linearise(reading, NO_BLOCK, False, values.atPose3(X(i)).matrix(), ZERO, NO_BIAS, rig)
-        if jacobians is not None:
-            jacobians[0] = H_x
-        return r
-
-    @stage("linearisation")
-    def velocity_callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose, v_WB_W = values.atPose3(X(i)).matrix(), values.atVector(V(i))
-        r, H_x, H_v, _ = _linearise(reading, NO_BLOCK, False, pose, v_WB_W, NO_BIAS, rig)
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = H_x, H_v
-        return r
+    def linearise(pose: Array, v_WB_W: Array = ZERO) -> Linearised:
+        return _linearise(reading, NO_BLOCK, False, pose, v_WB_W, NO_BIAS, rig)
 
     if row["kind"] == HEADING:
-        return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma[0]), [X(i)], pose_callback)
+        return custom_factor(gtsam.noiseModel.Isotropic.Sigma(1, sigma[0]), [X(i)], linearise)
     assert row["kind"] == DVL, "a kind without a factor"
     measured = np.isfinite(sigma)
     cov = np.diag(sigma[measured] ** 2) + g["rate_cov"][np.ix_(measured, measured)]
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), V(i)], velocity_callback)
+    return custom_factor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), V(i)], linearise)
 
 
 @stage("linearisation")
@@ -277,16 +301,10 @@ def carried_factor(
     """
     model = gtsam.noiseModel.Gaussian.Covariance(_carried_covariance(reading, block, at_i, rig))
 
-    @stage("linearisation")
-    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose, v_WB_W = values.atPose3(X(i)).matrix(), values.atVector(V(i))
-        bias = values.atConstantBias(B(i)).vector()
-        r, H_x, H_v, H_b = _linearise(reading, block, True, pose, v_WB_W, bias, rig)
-        if jacobians is not None:
-            jacobians[0], jacobians[1], jacobians[2] = H_x, H_v, H_b
-        return r
+    def linearise(pose: Array, v_WB_W: Array, bias: Array) -> Linearised:
+        return _linearise(reading, block, True, pose, v_WB_W, bias, rig)
 
-    return gtsam.CustomFactor(model, [X(i), V(i), B(i)], callback)
+    return custom_factor(model, [X(i), V(i), B(i)], linearise)
 
 
 @inner
@@ -314,15 +332,10 @@ def _linearise_displacement(pose_i: Array, pose_j: Array, dp_ij: Array) -> tuple
 def displacement_factor(i: int, j: int, dp_ij: Array, cov: Array) -> gtsam.CustomFactor:
     """Return the loose preintegrated-DVL factor between two keyframes; docs/conventions.md (6)."""
 
-    @stage("linearisation")
-    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
-        r, H_i, H_j = _linearise_displacement(pose_i, pose_j, dp_ij)
-        if jacobians is not None:
-            jacobians[0], jacobians[1] = H_i, H_j
-        return r
+    def linearise(pose_i: Array, pose_j: Array) -> Linearised:
+        return _linearise_displacement(pose_i, pose_j, dp_ij)
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], callback)
+    return custom_factor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j)], linearise)
 
 
 @compiled
@@ -352,16 +365,10 @@ def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: N
     K, cov = given_rotation(displacement[0]["N"])
     R_BI = rig[0]["R_BI"]
 
-    @stage("linearisation")
-    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose_i, pose_j = values.atPose3(X(i)).matrix(), values.atPose3(X(j)).matrix()
-        bias = values.atConstantBias(B(i)).vector()
-        r, H_i, H_j, H_b = _linearise_tight_displacement(displacement, K, pose_i, pose_j, bias, R_BI)
-        if jacobians is not None:
-            jacobians[0], jacobians[1], jacobians[2] = H_i, H_j, H_b
-        return r
+    def linearise(pose_i: Array, pose_j: Array, bias: Array) -> Linearised:
+        return _linearise_tight_displacement(displacement, K, pose_i, pose_j, bias, R_BI)
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], callback)
+    return custom_factor(gtsam.noiseModel.Gaussian.Covariance(cov), [X(i), X(j), B(i)], linearise)
 
 
 @compiled
@@ -383,15 +390,10 @@ def _linearise_prior(
 def prior_factor(prior: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
     """Return the prior (a STATE record, its whole P) as one factor on keyframe 0."""
 
-    @stage("linearisation")
-    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose, v_WB_W = values.atPose3(X(0)).matrix(), values.atVector(V(0))
-        r, H_x, H_v, H_b = _linearise_prior(prior, pose, v_WB_W, values.atConstantBias(B(0)).vector(), rig[0]["R_BI"])
-        if jacobians is not None:
-            jacobians[0], jacobians[1], jacobians[2] = H_x, H_v, H_b
-        return r
+    def linearise(pose: Array, v_WB_W: Array, bias: Array) -> Linearised:
+        return _linearise_prior(prior, pose, v_WB_W, bias, rig[0]["R_BI"])
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(prior[0]["P"]), [X(0), V(0), B(0)], callback)
+    return custom_factor(gtsam.noiseModel.Gaussian.Covariance(prior[0]["P"]), [X(0), V(0), B(0)], linearise)
 
 
 def linearise_alike(state: NavState, R_BI: Array) -> tuple[Callable[[int], None], Callable[[int], None]]:
@@ -459,6 +461,5 @@ def gtsam_failures() -> Iterator[None]:
     except Diverged:
         raise
     except (RuntimeError, ValueError, IndexError) as error:
-        text = " ".join(str(error).split())
-        named = re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), text)
+        named = re.sub(r"\b\d{10,}\b", lambda key: gtsam.Symbol(int(key.group())).string(), message_of(error))
         raise Diverged(f"GTSAM: {named[:300]}") from None

@@ -10,6 +10,7 @@ does not turn. Its covariance has the gyro noise on the IMU's lever arm in it, w
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -24,7 +25,7 @@ from ..physics.so3 import inverse_transform_into
 from ..physics.state import STATE, VELOCITY_0
 from ..physics.tie import inverse_jacobian, tie_residual
 from ..stages import stage
-from .gtsam_border import INTEGRATION_DENSITY, LEAST_WALK, by_gtsam, fill_state
+from .gtsam_border import INTEGRATION_DENSITY, LEAST_WALK, by_gtsam, custom_factor, fill_state
 
 
 @compiled
@@ -91,15 +92,6 @@ def imu_factor(i: int, j: int, block: NDArray[Any], R_i: Array, rig: NDArray[Any
     Q[GYRO_BIAS, GYRO_BIAS] = max(g["gyro_walk"], LEAST_WALK * g["gyro_density"]) ** 2 * T * np.eye(3)
     gravity, R_BI, kept = float(g["gravity"]), g["R_BI"].copy(), block.copy()
 
-    @stage("linearisation")
-    def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
-        pose_i, v_i, b_i = values.atPose3(X(i)).matrix(), values.atVector(V(i)), values.atConstantBias(B(i)).vector()
-        pose_j, v_j, b_j = values.atPose3(X(j)).matrix(), values.atVector(V(j)), values.atConstantBias(B(j)).vector()
-        r, *H = linearise_tie(kept, gravity, R_BI, pose_i, v_i, b_i, pose_j, v_j, b_j)
-        if jacobians is not None:
-            for n, matrix in enumerate(H):
-                jacobians[n] = matrix
-        return r
-
     keys = [X(i), V(i), B(i), X(j), V(j), B(j)]
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(Q), keys, callback)
+    linearise = partial(linearise_tie, kept, gravity, R_BI)
+    return custom_factor(gtsam.noiseModel.Gaussian.Covariance(Q), keys, linearise)

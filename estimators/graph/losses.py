@@ -10,7 +10,7 @@ import numpy as np
 
 from ...datasets.state import Array
 from ..robust import Loss, width
-from ..stages import stage
+from ..stages import stage, staged
 
 M_ESTIMATORS: dict[Loss, Any] = {
     "huber": gtsam.noiseModel.mEstimator.Huber,
@@ -38,7 +38,6 @@ def with_loss(factor: Any, loss: Loss) -> Any:
         return factor.cloneWithNewNoiseModel(gtsam.noiseModel.Robust.Create(estimator, factor.noiseModel()))
     ends = np.cumsum([3 if gtsam.Symbol(key).chr() == ord("v") else 6 for key in factor.keys()])  # noqa: SIM118
 
-    @stage("linearisation")
     def callback(_: Any, values: gtsam.Values, jacobians: Any) -> Array:
         if jacobians is None:
             return factor.whitenedError(values)
@@ -47,7 +46,9 @@ def with_loss(factor: Any, loss: Loss) -> Any:
             jacobians[k] = H
         return -b
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(estimator, model), factor.keys(), callback)
+    return gtsam.CustomFactor(
+        gtsam.noiseModel.Robust.Create(estimator, model), factor.keys(), staged("linearisation", callback)
+    )
 
 
 def distance(factor: Any, values: gtsam.Values) -> float:

@@ -18,7 +18,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import DIM, Belief
 from ...datasets.trajectory import Trajectory
 from ..between_keyframes import carry_on
-from ..interface import Diverged
+from ..interface import OUTLIERS, Diverged
 from ..keyframes import SUMMED, Keyframes
 from ..physics.dvl_preintegration import DISPLACEMENT, given_rotation, preintegrate_dvl
 from ..physics.imu import BLOCK, compile_rig, first_sample, over_world
@@ -89,7 +89,7 @@ class WindowPass:
         counts["relinearised"], counts["refactored"] = int(w["relinearised"]), int(w["refactored"])
         for kind, sensor in enumerate(SENSOR):
             if sensor in self._config.robust:
-                counts[f"outliers_{sensor}"] += int(w["outliers"][kind])
+                counts[OUTLIERS + sensor] += int(w["outliers"][kind])
         return counts
 
     def step(self, epoch: Epoch) -> None:
