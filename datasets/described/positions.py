@@ -12,7 +12,7 @@ from ..places import angle, is_place, radians, sexagesimal, turned_by
 from ..state import Array
 from . import description as d
 from .geodesy import SEMI_MAJOR_M, ecef_from_geodetic, enu_axes, enu_from_geodetic, geodetic_from_ecef
-from .rows import Rows, read_rows
+from .rows import Rows, number_or_nan, read_rows
 from .sources import Opening
 
 FAR_M = 100e3
@@ -120,16 +120,7 @@ def _angle(
 
 def _floats(raw: NDArray[Any]) -> Array:
     """Return numbers as read, NaN where they are none."""
-    if raw.dtype.kind != "T":
-        return raw.astype(float)
-
-    def number(text: Any) -> float:
-        try:
-            return float(text)
-        except ValueError:
-            return np.nan
-
-    return np.array([number(text) for text in raw], float)
+    return np.array([number_or_nan(text) for text in raw]) if raw.dtype.kind == "T" else raw.astype(float)
 
 
 def _guess(rows: Rows, part: d.Geodetic, row: int) -> str:

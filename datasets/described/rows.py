@@ -249,7 +249,7 @@ def _use_valid(rows: Rows, valid: d.Valid) -> None:
         values = rows.raw[column]
     if values.dtype.kind == "T":
         told = [text.strip() if isinstance(text, str) else "" for text in values]
-        good = np.array([text in valid.texts or _number(text) in valid.numbers for text in told], bool)
+        good = np.array([text in valid.texts or number_or_nan(text) in valid.numbers for text in told], bool)
     else:
         good = np.isin(values, valid.numbers)
     if len(good) and not good.any():
@@ -283,7 +283,8 @@ def _shown(stamps: Sequence[Any]) -> str:
     return (", ".join(map(str, stamps)) or "beyond the clock") + (COMMA_HINT if comma else "")
 
 
-def _number(text: str) -> float:
+def number_or_nan(text: Any) -> float:
+    """Return a text as a number; NaN where it is none."""
     try:
         return float(text)
     except ValueError:

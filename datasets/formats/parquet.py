@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
+from ..times import DAY_NS, NS_PER
 from .table import short
 
 if TYPE_CHECKING:
@@ -21,10 +22,6 @@ MOST_UNPACKED = 1000
 """The wanted columns may be this many times larger than the file: those of an IMU are 1 to 10 times larger."""
 SMALL_BYTES = 64 << 20
 """Up to here they may be, however small the file: it may hold one value, a million times."""
-NS_PER = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-"""Nanoseconds per unit of Arrow's times."""
-DAY_NS = 86_400_000_000_000
-"""Nanoseconds per day, the unit of Arrow's date32."""
 ABSENT = np.iinfo(np.int64).min
 """Stands for an integer or a time that is absent: no time that we accept, and NumPy's NaT."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from ....datasets.log import Log
-from ..findings.advice import clock_fix
+from ..findings.advice import clock_fix, late_or_early
 from ..findings.finding import Check, Finding
 from ..findings.fitting import FALSE_ALARM, Estimate
 from ..streams.channels import seconds
@@ -123,7 +123,7 @@ def _common(late: dict[str, Estimate]) -> Estimate | None:
 
 
 def _late(by: Estimate) -> str:
-    return f"{Estimate(abs(by.value), by.sigma).text('s')} {'late' if by.value > 0 else 'early'}"
+    return f"{Estimate(abs(by.value), by.sigma).text('s')} {late_or_early(by.value)}"
 
 
 def _finding(name: str, late: Estimate) -> Finding:

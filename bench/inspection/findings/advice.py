@@ -104,6 +104,11 @@ def clock_fix(stream: str, late_s: float) -> str:
     return f"{path}.time.clock_offset_s: {-late_s:.3f}"
 
 
+def late_or_early(late_s: float) -> str:
+    """Return "late" or "early", for by how much something is late."""
+    return "late" if late_s > 0 else "early"
+
+
 def put(raw: Raw, path: str, value: Any) -> None:
     """Set a key of a description by its path; null takes it away.
 

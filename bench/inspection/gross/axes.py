@@ -123,17 +123,17 @@ def told_apart(sketch: Sketch, alike: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [each for each, score in zip(alike, scores, strict=True) if score > max(scores) - CLEARLY]
 
 
-def agreement(sketch: Sketch, each: Hypothesis, v_B: Array | None = None) -> float:
+def agreement(sketch: Sketch, each: Hypothesis, dvl_turn: float = 0.0) -> float:
     """Return the log likelihood of what DVL and depth sensor say of the motion, by the accelerometer.
 
     A depth changes by the vertical part of the velocity; in a turn a vehicle is pushed sideways by v × yaw rate. The
-    velocity is the DVL's, or v_B (n, 3) instead.
+    velocity is the DVL's, turned by `dvl_turn` rad about B's z.
     """
     motion, log = sketch.velocity, sketch.log
     if motion is None:
         return 0.0
-    heard = motion[1]
-    v_B = motion[0] if v_B is None else v_B
+    c, s = np.cos(dvl_turn), np.sin(dvl_turn)
+    v_B, heard = motion[0] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]), motion[1]
     f_B = sketch.f_I @ each.A.T @ np.asarray(log.rig.imu.R_BS).T
     rate = np.einsum("ni,ni->n", sketch.up_I @ each.A.T, sketch.w_I @ each.G.T)
     score = _explained(f_B[heard, 1], (v_B[:, 0] * rate)[heard])

@@ -11,7 +11,7 @@ import numpy as np
 from ....datasets.log import AttitudeStream, ImuStream, Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import TimeArray
-from ..findings.advice import ATTITUDE, clock_fix
+from ..findings.advice import ATTITUDE, clock_fix, late_or_early
 from ..findings.finding import Check, Finding
 from ..streams.norms import NO_GRAVITY, check_norms
 from .attitudes import attitude_findings, random_heading
@@ -28,8 +28,6 @@ WEAKEST = 1.0
 """m/s²: gravity in the smallest wrong unit that is still read, g."""
 TURNS = 0.7
 """Least correlation of heading and gyro that tells that both turn the same way."""
-CLOCK_MATTERS_S = 2.0
-"""Finer delays are left to the comparison of all clocks."""
 RUNNING_S = 3.0
 """Headings are compared by their changes over this."""
 
@@ -118,15 +116,11 @@ def _findings(sketch: Sketch) -> list[Finding]:
 
 def _imu_yaw(sketch: Sketch, path_agrees: bool) -> list[Finding]:
     """Find an IMU that is mounted a quarter or half a turn off about the vertical, by the motion of the DVL."""
-    motion, none = sketch.velocity, hypotheses()[0]
+    none = hypotheses()[0]
     now = agreement(sketch, none)
-    if motion is None or now > CLEARLY:
+    if sketch.velocity is None or now > CLEARLY:
         return []
-    found = {}
-    for quarter in (1, 2, 3):
-        c, s = ((0, 1), (-1, 0), (0, -1))[quarter - 1]
-        v_B = motion[0] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        found[quarter] = agreement(sketch, none, v_B)
+    found = {quarter: agreement(sketch, none, dvl_turn=quarter * np.pi / 2) for quarter in (1, 2, 3)}
     best = max(found, key=lambda quarter: found[quarter])
     if found[best] < now + SURELY:
         return []
@@ -161,14 +155,10 @@ def _heading_clock(sketch: Sketch) -> list[Finding]:
     both = heard[lag:] & heard[:-lag]
     turns = [np.where(both, x[lag:] - x[:-lag], 0.0) for x in (sketch.on_grid(t_s, psi), sketch.yaw)]
     shift = shift_of(turns[0], turns[1], sketch.step_s)
-    if not shift.matters or abs(shift.late_s) < CLOCK_MATTERS_S:
+    if not shift.matters:
         return []
     if heading_fits(sketch, shift.late_s):
-        message = f"The IMU turns {abs(shift.late_s):.1f} s {_late(-shift.late_s)} by the clock of the others."
+        message = f"The IMU turns {abs(shift.late_s):.1f} s {late_or_early(-shift.late_s)} by the clock of the others."
         return [Finding("imu", message, clock_fix("imu", -shift.late_s))]
-    message = f"The heading turns {abs(shift.late_s):.1f} s {_late(shift.late_s)} by the IMU's clock."
+    message = f"The heading turns {abs(shift.late_s):.1f} s {late_or_early(shift.late_s)} by the IMU's clock."
     return [Finding("heading", message, clock_fix("heading", shift.late_s))]
-
-
-def _late(shift_s: float) -> str:
-    return "late" if shift_s > 0 else "early"

@@ -19,7 +19,7 @@ from ....datasets.described.geodesy import (
 from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array
-from ..findings.advice import clock_fix
+from ..findings.advice import clock_fix, late_or_early
 from ..findings.finding import Finding
 from ..findings.fitting import Mask, Plane
 from ..streams.channels import seconds
@@ -350,7 +350,7 @@ def heard_under_water(sketch: Sketch) -> list[Finding]:
     late_s = float(lags[none].mean())
     message = (
         f"{now:.0%} of the fixes are stamped while the depth sensor is more than {DEEP_M:g} m under water, and none if "
-        f"the stamps of the GPS are taken to be {abs(late_s):.0f} s {'late' if late_s > 0 else 'early'}."
+        f"the stamps of the GPS are taken to be {abs(late_s):.0f} s {late_or_early(late_s)}."
     )
     return [Finding("gps", message, clock_fix("gps", late_s))]
 
@@ -458,7 +458,7 @@ def _clock(sketch: Sketch, course: Course, path: list[Plane], fixes: Fixes, now:
         return None
     who = "DVL" if stream == "dvl" else _whose(log, fixes)
     message = (
-        f"The stamps of the {who} are {abs(late_s):.1f} s {'late' if late_s > 0 else 'early'}: with that the "
+        f"The stamps of the {who} are {abs(late_s):.1f} s {late_or_early(late_s)}: with that the "
         f"positions of the {_whose(log, fixes)} are {then.rms_m:.2g} m (rms) off the path by DVL and yaw, and "
         f"{now.rms_m:.3g} m now."
     )
@@ -516,16 +516,13 @@ def _size_and_turn(sketch: Sketch, course: Course, fixes: Fixes, now: Match) -> 
 
 def turned(sketch: Sketch, turn: float) -> str:
     """Return whether "dvl" or "heading" is turned, by the accelerometers in turns and dives; "" if they cannot tell."""
-    motion = sketch.velocity
-    if motion is None:
+    if sketch.velocity is None:
         return ""
     offset = _off_the_truth(sketch)
     if offset is not None:
         both = abs(np.angle(np.exp(1j * (offset + turn)))), abs(offset)
         return ("heading", "dvl")[int(np.argmin(both))] if min(both) < TURN_MATTERS / 2 else ""
-    c, s = np.cos(turn), np.sin(turn)
-    v_B = motion[0] @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-    as_is, then = (agreement(sketch, hypotheses()[0], v) for v in (motion[0], v_B))
+    as_is, then = (agreement(sketch, hypotheses()[0], dvl_turn) for dvl_turn in (0.0, turn))
     return "dvl" if then > as_is + CLEARLY else "heading" if as_is > then + CLEARLY else ""
 
 

@@ -19,8 +19,6 @@ TURN_S = 3.0
 """Changes of heading are taken over this: long enough for a turn to stand out of a compass's noise."""
 ROWS = 50.0
 """Rows that the evidence counts as at most: neighbouring errors are alike."""
-SURELY = 20.0
-"""Least difference of the log likelihoods: one in 10⁹ by chance if there were 50 independent rows."""
 
 
 @dataclass(frozen=True, eq=False)

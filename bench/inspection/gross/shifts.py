@@ -14,6 +14,8 @@ PEAK = 0.8
 """Least correlation at the lag: 64 % of the motion is then common to both."""
 NEAR = 20
 """Steps around the coarse peak in which the exact one is sought."""
+MATTERS_S = 2.0
+"""Finer delays are left to the comparison of all clocks."""
 BETTER = 0.3
 """What the lag must leave at most of the variance that differs without it."""
 
@@ -27,8 +29,12 @@ class Shift(NamedTuple):
 
     @property
     def matters(self) -> bool:
-        """Whether the lag explains most of the difference, and the two are alike with it."""
-        return self.peak > PEAK and 1 - self.peak**2 < BETTER * (1 - max(self.now, 0.0) ** 2)
+        """Whether the lag is gross, explains most of the difference, and the two are alike with it."""
+        return (
+            abs(self.late_s) > MATTERS_S
+            and self.peak > PEAK
+            and 1 - self.peak**2 < BETTER * (1 - max(self.now, 0.0) ** 2)
+        )
 
 
 def shift_of(a: Array, b: Array, step_s: float) -> Shift:

@@ -6,13 +6,13 @@ import numpy as np
 
 from ....datasets.log import Log, ReadingStream
 from ....datasets.quantities import DEGREE
+from ....datasets.times import NS_PER
 from ..findings.finding import Finding
+from ..findings.fitting import MAD_TO_SIGMA
 from ..streams.channels import imu_period_ns
 
 SLOWEST_IMU_HZ = 2.0
 """Below this an IMU's samples say nothing of a vehicle's motion between them: its time is in another unit."""
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Units of time by their names in log.yaml, s."""
 ALIKE = 0.2
 """Relative: two streams of one log cover the same time, within a fifth."""
 BOUNDS = {"dvl": (1e-6, 5.0, "m/s"), "depth": (1e-6, 50.0, "m"), "gps": (1e-4, 1e3, "m"), "heading": (1e-7, 1.6, "°")}
@@ -54,7 +54,7 @@ def _unit_ratio(ratio: float) -> float | None:
 
 
 def _other_unit(name: str, factor: float, than: str) -> Finding:
-    unit = next((unit for unit, size in UNITS.items() if abs(size / factor - 1) < ALIKE), "s")
+    unit = next((unit for unit, ns in NS_PER.items() if abs(ns * 1e-9 / factor - 1) < ALIKE), "s")
     message = (
         f"By their stamps the {name} readings last {1 / factor:g} times as long as those of {than}: their time is "
     )
@@ -106,5 +106,5 @@ def _scatter(stream: ReadingStream) -> tuple[float, float]:
     step = np.diff(z, axis=0)
     step = np.angle(np.exp(1j * step)) if stream.name == "heading" else step
     second = np.abs(np.diff(step, axis=0))
-    sigma = 1.4826 * np.median(second, axis=0) / SECOND_DIFFERENCE
+    sigma = MAD_TO_SIGMA * np.median(second, axis=0) / SECOND_DIFFERENCE
     return float(sigma.min()), float(sigma.max())

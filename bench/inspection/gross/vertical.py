@@ -9,7 +9,7 @@ import numpy as np
 from ....datasets.described.description import Height
 from ....datasets.log import Log
 from ....datasets.state import Array
-from ..findings.advice import clock_fix
+from ..findings.advice import clock_fix, late_or_early
 from ..findings.finding import Finding
 from ..findings.fitting import Mask
 from ..streams.channels import seconds
@@ -26,8 +26,6 @@ IN_THE_AIR_M = 1.5
 """A depth sensor whose median is higher above the sea surface is on no vehicle that has one."""
 SCALE_MATTERS = 0.15
 """Relative: density and speed of sound explain a few percent."""
-CLOCK_MATTERS_S = 2.0
-"""Finer delays are left to the comparison of all clocks."""
 PRESSURES = {"bar": 10.0, "kPa": 0.1, "mbar": 0.01, "Pa": 1e-4, "psi": 0.69}
 """Metres of water under one unit, within 3 %."""
 
@@ -138,7 +136,7 @@ def _inverse(slope: Slope) -> Slope:
 
 def _is_wrong(slope: Slope) -> bool:
     scaled = abs(slope.correlation) > ALIKE and abs(slope.value - 1) > SCALE_MATTERS
-    return scaled or (slope.shift.matters and abs(slope.shift.late_s) > CLOCK_MATTERS_S)
+    return scaled or slope.shift.matters
 
 
 def _words(log: Log, name: str) -> str:
@@ -147,11 +145,8 @@ def _words(log: Log, name: str) -> str:
 
 def _unsure(log: Log, pairs: dict[tuple[str, str], Slope], wrong: set[tuple[str, str]]) -> Finding:
     a, b = sorted(wrong)[0]
-    slope = pairs[a, b]
-    if slope.shift.matters and abs(slope.shift.late_s) > CLOCK_MATTERS_S:
-        how = f"{slope.shift.late_s:+.1f} s later than"
-    else:
-        how = f"{slope.value:.3g} times as far as"
+    late, slope = pairs[a, b].shift, pairs[a, b].value
+    how = f"{late.late_s:+.1f} s later than" if late.matters else f"{slope:.3g} times as far as"
     return Finding(a, f"The height by the {_words(log, a)} changes {how} that by the {_words(log, b)}.")
 
 
@@ -167,9 +162,9 @@ def _turned(log: Log, name: str, how: str) -> Finding:
 def _finding(log: Log, name: str, other: str, slope: Slope) -> Finding:
     """Return what is wrong with a height that another one contradicts."""
     shift, who = slope.shift, f"The height by the {_words(log, name)}"
-    if shift.matters and abs(shift.late_s) > CLOCK_MATTERS_S:
-        late = "late" if shift.late_s > 0 else "early"
-        message = f"{who} changes {abs(shift.late_s):.1f} s {late} by that of the {_words(log, other)}."
+    if shift.matters:
+        late = f"{abs(shift.late_s):.1f} s {late_or_early(shift.late_s)}"
+        message = f"{who} changes {late} by that of the {_words(log, other)}."
         return Finding(name, message, clock_fix(name, shift.late_s))
     if abs(slope.value + 1) < 2 * SCALE_MATTERS:
         return _turned(log, name, f"climbs where the {_words(log, other)} sinks (slope {slope.value:.2f})")
