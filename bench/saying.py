@@ -23,13 +23,16 @@ def say(message: str) -> None:
         print(text if width is None else folded(text, width), file=sys.stderr, flush=True)
 
 
-def folded(text: str, width: int) -> str:
-    """Return a text in lines of `width` letters, folded between words; a longer word, as of a path, stays whole."""
+def folded(text: str, width: int, indent: int = 2) -> str:
+    """Return a text in lines of `width` letters, folded between words; a longer word, as of a path, stays whole.
+
+    Lines after the first begin `indent` further to the right.
+    """
     begin = text[: len(text) - len(text.lstrip())]
     return fill(
         text,
         max(width, LEAST_WIDTH),
-        subsequent_indent=f"{begin}  ",
+        subsequent_indent=begin + indent * " ",
         break_on_hyphens=False,
         break_long_words=False,
     )

@@ -54,9 +54,21 @@ def nearest_file(path: Path, *, folders: bool = False) -> str:
     return nearest(path.name, [other.name for other in beside if folders or other.is_file()])
 
 
+LONGEST_MESSAGE = 2000
+"""Characters of another program's message that are kept: a page."""
+
+
+def message_of(error: BaseException) -> str:
+    """Return the message of an error on one line, as `shown` does; another package's error may not have one to show."""
+    try:
+        return shown(" ".join(str(error).split())[:LONGEST_MESSAGE])
+    except Exception:  # its class may raise anything here
+        return "(its message cannot be shown)"
+
+
 def one_line(error: BaseException) -> str:
     """Return the class and the message of an error, on one line, as `shown` does."""
-    return shown(" ".join(f"{type(error).__name__}: {error}".split()))
+    return f"{shown(type(error).__name__)}: {message_of(error)}".rstrip()
 
 
 def not_loaded(point: EntryPoint, error: BaseException) -> str:

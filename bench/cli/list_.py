@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from enum import StrEnum
 from shutil import get_terminal_size
-from textwrap import fill
 from typing import Annotated
 
 import typer
+
+INDENT = 4
+"""Letters by which the further lines of an entry are indented, on a terminal."""
 
 
 class Listing(StrEnum):
@@ -23,15 +25,11 @@ class Listing(StrEnum):
 def list_(what: Annotated[Listing, typer.Argument(metavar="LIST")]) -> None:
     """List estimators, logs, experiments or scores."""
     from ...datasets.errors import shown
+    from ..saying import folded
 
     for name, about in LISTS[what]().items():
         line = shown(f"{name}: {about}" if about else name)
-        typer.echo(folded(line, get_terminal_size().columns) if sys.stdout.isatty() else line)
-
-
-def folded(line: str, width: int) -> str:
-    """Fold a line between words to the width of a terminal, with the further lines indented."""
-    return fill(line, width, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+        typer.echo(folded(line, get_terminal_size().columns, INDENT) if sys.stdout.isatty() else line)
 
 
 def _estimators() -> dict[str, str]:

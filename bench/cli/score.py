@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -76,6 +75,7 @@ def score(
     Says how many of its poses they are taken over, and what would match more.
     """
     from ..metrics import ScoreError, ate, check_step, rpe
+    from ..saying import folded
 
     check_step(delta, unit.value)
     if not 0 <= tolerance_s <= LONGEST_TOLERANCE_S:
@@ -96,7 +96,7 @@ def score(
         settings += f"\nno RPE: {str(error).removeprefix('rpe: ')}"
     _print_scores(rows)
     for line in (*settings.splitlines(), *_hints(true, estimated, absolute, tolerance_s, offset_s)):
-        typer.echo(fill(line, LETTERS, subsequent_indent="  "))
+        typer.echo(folded(line, LETTERS))
 
 
 def _shifted(estimate: Trajectory, offset_s: float) -> Trajectory:

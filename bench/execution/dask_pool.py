@@ -20,6 +20,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from ...datasets.errors import one_line
 from ..errors import ExperimentError
 from .dask_worker import Greeting, dismiss, do, greet, greeting
 from .pool import Queue
@@ -164,7 +165,7 @@ def _scheduler(address: str) -> str:
         return str(json.loads(Path(address).read_text(encoding="utf-8"))["address"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ExperimentError(
-            f"--dask {address}: not a scheduler file ({type(error).__name__}: {error}); "
+            f"--dask {address}: not a scheduler file ({one_line(error)}); "
             f"`dask scheduler --scheduler-file {address}` makes one"
         ) from None
 
@@ -312,10 +313,10 @@ class _Cluster:
             yield from self._lost(worker)
         elif worker.task is None:
             worker.greeting = worker.greeting or Greeting({}, {})
-            self._refuse(worker, f"{type(error).__name__}: {error}")
+            self._refuse(worker, one_line(error))
         else:
             task, worker.task = worker.task, None
-            yield Finished([task.row("failed", f"{type(error).__name__}: {error}") | _provenance(worker)])
+            yield Finished([task.row("failed", one_line(error)) | _provenance(worker)])
 
     def _lost(self, worker: _RemoteWorker) -> Iterator[Finished]:
         """Put back the task of a lost worker, unless it has lost TRIES workers."""

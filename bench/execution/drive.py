@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.epochs import Epoch, Voyage, cut
-from ...datasets.errors import shown
+from ...datasets.errors import message_of, one_line
 from ...datasets.log import AttitudeStream, HeadingStream, Log
 from ...datasets.read_only import read_only
 from ...datasets.rig import Rig
@@ -29,7 +29,7 @@ from ...estimators.physics.innovation import INNOVATION, innovations
 from ...estimators.registry import is_ours
 from ..results.identity import content_sha256
 from .noticed import ON_TIME_NS, late_readings, noticed
-from .outputs import check_counts, check_form, check_smoothed, wrong_value
+from .outputs import check_counts, check_form, check_smoothed, check_time, wrong_value
 from .result import Result, Status
 
 LOST_M = 1e7
@@ -50,8 +50,8 @@ class Ending(NamedTuple):
         if isinstance(error, KeyboardInterrupt):
             raise error
         if isinstance(error, Diverged):
-            return Ending("diverged", shown(_message(error)), t_ns)
-        return Ending("failed", describe(error), t_ns, traceback_of(error))
+            return Ending("diverged", message_of(error), t_ns)
+        return Ending("failed", one_line(error), t_ns, traceback_of(error))
 
 
 class Recorder:
@@ -128,7 +128,7 @@ class NisCollector:
         Raises:
             ValueError: the belief is for another time.
         """
-        _check_time(belief, epoch.t_ns)
+        check_time(belief, epoch.t_ns)
         if np.isnan(belief.P).all():
             return
         table = innovations(belief, epoch.readings[self._on_time(epoch)], self._rig)
@@ -143,11 +143,6 @@ class NisCollector:
     @staticmethod
     def _on_time(epoch: Epoch) -> NDArray[np.bool_]:
         return epoch.t_ns - epoch.readings["t_ns"] <= ON_TIME_NS
-
-
-def _check_time(belief: Belief, t_ns: int) -> None:
-    if belief.t_ns != t_ns:
-        raise ValueError(f"asked for a belief at {t_ns} ns, was given one at {belief.t_ns} ns")
 
 
 def run_log(
@@ -345,27 +340,13 @@ def _smoothed_ending(smoothed: Trajectory, voyage: Voyage, given_ns: TimeArray) 
     return Ending(wrong.status, f"finish(): {wrong.cause}", int(smoothed.t_ns[wrong.row]))
 
 
-LONGEST_CAUSE = 2000
-"""Characters of an error's message that are kept: a page."""
 LONGEST_TRACEBACK = 20_000
 """Characters of a traceback that are kept, its end: some two hundred frames."""
-
-
-def describe(error: BaseException) -> str:
-    """Return type and message of an error, on one line."""
-    return shown(f"{type(error).__name__}: {_message(error)}")
 
 
 def traceback_of(error: BaseException) -> str:
     """Return the end of an error's traceback, as Python prints it."""
     return "".join(format_exception(error))[-LONGEST_TRACEBACK:]
-
-
-def _message(error: BaseException) -> str:
-    try:
-        return " ".join(str(error).split())[:LONGEST_CAUSE]
-    except Exception:  # another package's class of errors may raise anything here
-        return "(its message cannot be shown)"
 
 
 @contextmanager

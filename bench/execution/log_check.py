@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from ...datasets.described.description import read_description
 from ...datasets.described.opening import find_log
 from ...datasets.log import Log
+from ...datasets.notes import Note
 from ..errors import ExperimentError
 
 if TYPE_CHECKING:
@@ -30,9 +31,9 @@ def check_log(log: Log, name: str, data: Path | None = None) -> tuple[Finding, .
     return tuple(resolved(finding, description) for finding in found)
 
 
-def note_of(finding: Finding) -> str:
-    """Return a finding as the text of a note of a run, its stream first."""
-    return f"{finding.stream}: {finding.message}"
+def note_of(finding: Finding) -> Note:
+    """Return a finding as a note of a run, its stream first in the text."""
+    return Note(f"{finding.stream}: {finding.message}", "check", finding.stream)
 
 
 def report(findings: Findings, strict: bool, say: Callable[[str], None]) -> None:

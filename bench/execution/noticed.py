@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from ...datasets.log import Log, ReadingStream
 from ...datasets.notes import Note
+from ...estimators.interface import OUTLIERS
 
 ON_TIME_NS = 1_000_000
 """A reading received at most this long after it was true came in time: 1 ms, in which 2 m/s is 2 mm."""
-
-OUTLIERS = "outliers_"
-"""Prefix of the counts of readings that an estimator rejected, or gave less weight."""
 
 
 def late_readings(log: Log, sensors: Collection[str], start_ns: int, end_ns: int) -> int:

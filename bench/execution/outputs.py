@@ -36,8 +36,7 @@ def check_form(belief: Belief, t_ns: int) -> None:
     """
     if not isinstance(belief, Belief):
         raise TypeError(f"belief() returned {type(belief).__name__}, expected a fathom.datasets.Belief")
-    if belief.t_ns != t_ns:
-        raise ValueError(f"asked for a belief at {t_ns} ns, was given one at {belief.t_ns} ns")
+    check_time(belief, t_ns)
     x = belief.state
     for name, shape, values in (
         ("R_WB", (3, 3), x.R_WB),
@@ -49,6 +48,16 @@ def check_form(belief: Belief, t_ns: int) -> None:
     ):
         if type(values) is not np.ndarray or values.dtype is not FLOAT or values.shape != shape:
             _check_array(name, values, shape)
+
+
+def check_time(belief: Belief, t_ns: int) -> None:
+    """Refuse a belief of another time than t_ns.
+
+    Raises:
+        ValueError: it is one.
+    """
+    if belief.t_ns != t_ns:
+        raise ValueError(f"asked for a belief at {t_ns} ns, was given one at {belief.t_ns} ns")
 
 
 def _check_array(name: str, values: Any, shape: tuple[int, ...]) -> None:

@@ -14,6 +14,7 @@ from queue import Empty, SimpleQueue
 from subprocess import TimeoutExpired
 from typing import TypeAlias
 
+from ...datasets.errors import one_line
 from ...estimators.registry import ESTIMATORS
 from .child import Child, start, uninterrupted
 from .task import Finished, Stage, Task
@@ -116,8 +117,8 @@ class Worker:
                 self.child.process.wait(GRACE_S)
             code = self.child.process.returncode
             return self._fail("worker closed its connection" if code is None else f"worker died (exit code {code})")
-        what = type(answer).__name__
-        why = f"{what}: {answer}" if isinstance(answer, Exception) else f"{what}, which is no result of this run"
+        what = f"{type(answer).__name__}, which is no result of this run"
+        why = one_line(answer) if isinstance(answer, Exception) else what
         return self._fail(f"worker gave what cannot be read: {why:.200}")
 
     def hung(self) -> Finished:

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from ...datasets.errors import message_of
 from ...estimators.registry import package_of
 from ..experiment.plan import EstimatorSpec, Experiment, LogSpec
 from ..metrics.floor_ratio import FLOORS
@@ -120,7 +121,7 @@ def rebuild(stored: Stored, data: Path | None, hash_of: HashOf) -> Task:
     except KeyError as error:
         raise CannotRunError(f"its spec has no {error}: another version wrote it") from None
     except ValueError as error:  # of a log, an estimator, or pydantic
-        raise CannotRunError(" ".join(str(error).split())) from None
+        raise CannotRunError(message_of(error)) from None
     return replace(Task.of(experiment, run, data, spec["repair"]), readings_sha256=readings)
 
 

@@ -22,6 +22,7 @@ from ..errors import ExperimentError, StoppedError
 from ..experiment.plan import Experiment, Run
 from ..files import writing
 from ..results.identity import FINAL, content_sha256
+from ..results.rows import run_keys
 from ..results.store import Row, Store, provenance, sole_writer, with_whole_specs
 from ..saying import say
 from .cold_start import compile_first
@@ -162,9 +163,8 @@ def _refuse_silence(runs: Sequence[Run], rows: pd.DataFrame) -> None:
     Raises:
         StoppedError: names the first such run.
     """
-    seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
-    told = set(zip(rows["log"], rows["label"], seeds, strict=True))
-    silent = [run for run in runs if (run.log.name, run.estimator.label, run.seed) not in told]
+    told = set(run_keys(rows))
+    silent = [run for run in runs if run.key not in told]
     if silent:
         raise StoppedError(
             f"{len(silent)} of {len(runs)} planned runs have no result, the first is {silent[0]}; finished runs are "
@@ -208,16 +208,15 @@ def _keep(finished: Finished, store: Store, folder: Path) -> list[Row]:
 
 def _missing(tasks: Sequence[Task], rows: pd.DataFrame, force: bool) -> tuple[list[Task], int]:
     """Return the tasks that are not in the store yet, and how many of them are there under another identity."""
-    final = rows.loc[rows["status"].isin(FINAL), ["log", "label", "seed", "identity"]].astype(object)
-    finished = set(final.where(final.notna(), None).itertuples(index=False, name=None))
-    named = {key[:3] for key in finished}
+    final = rows.loc[rows["status"].isin(FINAL)]
+    finished = set(zip(run_keys(final), final["identity"], strict=True))
+    named = {key for key, _ in finished}
     missing, renewed = [], 0
     for task in tasks:
-        names = (task.run.log.name, task.run.estimator.label, task.run.seed)
-        stands = (*names, task.identity) in finished
+        stands = (task.run.key, task.identity) in finished
         if force or not stands:
             missing.append(task)
-            renewed += names in named and not stands
+            renewed += task.run.key in named and not stands
     return missing, renewed
 
 
@@ -306,28 +305,26 @@ def _opened(tasks: Sequence[Task], check: bool) -> tuple[list[Task], list[dict[s
 
 def rows_of(rows: pd.DataFrame, runs: Sequence[Run]) -> pd.DataFrame:
     """Return the rows of these runs, in their order: the store may hold those of earlier experiments of this name."""
-    place = {(run.log.name, run.estimator.label, run.seed): k for k, run in enumerate(runs)}
-    keys = zip(rows["log"], rows["label"], rows["seed"], strict=True)
-    order = [place.get((log, label, None if pd.isna(seed) else int(seed)), -1) for log, label, seed in keys]
+    place = {run.key: k for k, run in enumerate(runs)}
+    order = [place.get(key, -1) for key in run_keys(rows)]
     rows = rows.assign(order=order).query("order >= 0").sort_values("order", kind="stable")
     return rows.drop(columns="order").reset_index(drop=True)
 
 
 def outdated(rows: pd.DataFrame, experiment: Experiment) -> pd.Series:
     """Return which of the rows `rows_of` gave were made with another spec or version than the present one."""
-    runs = {(run.log.name, run.estimator.label, run.seed): run for run in experiment.runs()}
+    runs = {run.key: run for run in experiment.runs()}
     versions = json.loads(provenance()["versions"])
 
-    def is_old(row: Any) -> bool:
+    def is_old(key: tuple[str, str, int | None], row: Any) -> bool:
         if not isinstance(row.spec, str) or not isinstance(row.versions, str):
             return True
-        seed = None if pd.isna(row.seed) else int(row.seed)
-        spec = json.loads(row.spec) | {"seed": seed}
-        today = experiment.spec(runs[row.log, row.label, seed], spec.get("repair", False))
+        spec = json.loads(row.spec) | {"seed": runs[key].seed}
+        today = experiment.spec(runs[key], spec.get("repair", False))
         as_text = [json.dumps(one, sort_keys=True) for one in (spec, today)]
         return as_text[0] != as_text[1] or json.loads(row.versions) != versions
 
-    return pd.Series([is_old(row) for row in rows.itertuples()], index=rows.index, dtype=bool)
+    return pd.Series(list(map(is_old, run_keys(rows), rows.itertuples())), index=rows.index, dtype=bool)
 
 
 class _Progress:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...datasets.errors import shown
+from ...datasets.notes import Note
 from ...datasets.trajectory import COVARIANCE, Trajectory
 from ...estimators.registry import package_of
 from ..experiment.plan import Experiment, Run
@@ -52,7 +53,7 @@ class Task:
     data: Path | None = None
     repair: bool = False
     readings_sha256: str | None = None
-    checked: tuple[str, ...] = ()
+    checked: tuple[Note, ...] = ()
 
     @staticmethod
     def of(experiment: Experiment, run: Run, data: Path | None = None, repair: bool = False) -> Task:

@@ -17,9 +17,9 @@ from platform import node
 
 import numpy as np
 
-from ...datasets.errors import DatasetError
+from ...datasets.errors import DatasetError, one_line
 from ...datasets.log import Log
-from ...datasets.notes import Note, as_data
+from ...datasets.notes import as_data
 from ...datasets.simulated.scenario import Scenario
 from ...estimators.interface import Estimator
 from ...estimators.registry import ESTIMATORS
@@ -31,7 +31,7 @@ from ..metrics.floor_ratio import FLOORS, floor_scores
 from ..metrics.scoring import INNOVATIONS, by_reason, can_judge, scored
 from ..results.identity import content_sha256
 from ..results.store import Row
-from .drive import describe, run_log, traceback_of, warm_up
+from .drive import run_log, traceback_of, warm_up
 from .result import Result, costs, innovation_dof, innovation_scores
 from .task import Finished, Stage, Task, file_name, parquet
 
@@ -96,7 +96,7 @@ class WorkerCache:
             self._enter(task, "scoring", SCORE_S)
             return self.finished(task, log, result, {"started": started, "peak_mb": memory.peak_mb})
         except (Exception, SystemExit) as error:  # another package's code may raise anything, or exit
-            row = task.row("failed", describe(error)) | {"started": started, "traceback": traceback_of(error)}
+            row = task.row("failed", one_line(error)) | {"started": started, "traceback": traceback_of(error)}
             return Finished([row])
 
     def _enter(self, task: Task, doing: str, extra_s: float = 0.0) -> None:
@@ -155,7 +155,6 @@ class WorkerCache:
         """Score a run: one row per output, and its trajectories beside them."""
         scoring = task.scoring
         files: dict[str, bytes] = {}
-        checked = [Note(text, "check", text.partition(":")[0]) for text in task.checked]
         shared = {
             "failed_at_s": result.failed_at_s,
             "traceback": result.traceback,
@@ -163,7 +162,7 @@ class WorkerCache:
             "duration_s": result.duration_s,
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
-            "notes": json.dumps([as_data(note) for note in (*log.notes, *checked, *result.notes)]),
+            "notes": json.dumps([as_data(note) for note in (*log.notes, *task.checked, *result.notes)]),
             **costs(result),
             **extra,
         }

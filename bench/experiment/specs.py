@@ -151,6 +151,11 @@ class Run(NamedTuple):
     estimator: EstimatorSpec
     seed: int | None
 
+    @property
+    def key(self) -> tuple[str, str, int | None]:
+        """Log, label and seed: what a row of the store says of which run it is."""
+        return self.log.name, self.estimator.label, self.seed
+
     def __str__(self) -> str:
         seed = "" if self.seed is None else f" seed {self.seed}"
         return f"{self.log.name} / {self.estimator.label}{seed}"

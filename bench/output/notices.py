@@ -33,14 +33,15 @@ WORDS = {
 }
 """What lines and tables call each kind of note, the worst first."""
 assert list(WORDS) == [kind for kind in KINDS if kind != "about"]
+PLACES = {kind: place for place, kind in enumerate(WORDS)}
 ROUTINE = ("outside", "late", "merged", "carried", "void")
 """Kinds that are no fault of a log; the terminal has one line for each, of the log where it is most."""
 IN_WORDS = ("damage", "check", "silent", "repaired", "start")
 """Kinds whose sentences say more than a number."""
 TEXT_LETTERS = 150
 """Of a note's sentence in a line: two lines of a terminal of 80 columns."""
-
-
+MOST_TEXTS = 5
+"""Different sentences that a cell of the report holds; a run's row has them all."""
 LEAST_SHARE = 1e-3
 """Shown as a number: of less it is enough to know that it is little."""
 
@@ -91,8 +92,7 @@ def notices(rows: Sequence[Record]) -> list[Notice]:
         runs = [row for row, *_ in groups(of_log, "label", "seed").values() if row["notes"]]
         for (kind, stream), each in _by_kind(runs).items():
             found.append(_notice(log, kind, stream, each, len({row["label"] for row in runs})))
-    places = list(WORDS)
-    return sorted(found, key=lambda notice: places.index(notice.kind))
+    return sorted(found, key=lambda notice: PLACES[notice.kind])
 
 
 def _by_kind(runs: Sequence[Record]) -> dict[tuple[str, str], list[tuple[Record, dict[str, Any]]]]:
@@ -181,12 +181,11 @@ def sheet(rows: Sequence[Record]) -> Sheet | None:
     found = notices(rows)
     if not found:
         return None
-    places = {kind: place for place, kind in enumerate(WORDS)}
     table = [
         Line(
             notice.log,
             [
-                Cell(WORDS[notice.kind], places[notice.kind]),
+                Cell(WORDS[notice.kind], PLACES[notice.kind]),
                 Cell(notice.stream or "whole log", notice.stream or "whole log"),
                 Cell(notice.amount, notice.share),
                 Cell(notice.label or "all", notice.label or "all"),
@@ -197,7 +196,3 @@ def sheet(rows: Sequence[Record]) -> Sheet | None:
     ]
     note = ["the worst first; up to: of the run with the largest share, where seeds or estimators differ"]
     return Sheet("What the runs noticed", note, ["log", "kind", "about", "how many", "estimator", "in words"], table)
-
-
-MOST_TEXTS = 5
-"""Different sentences that a cell of the report holds; a run's row has them all."""

@@ -12,6 +12,7 @@ from ..execution.sweep import Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
 from ..files import writing
 from ..results.paired import paired
+from ..results.rows import run_keys
 from ..results.store import load_runs
 from ..results.summary import Record, Records, Rows, groups, records
 from ..saying import say
@@ -87,9 +88,7 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
 
 def _lacks_runs(rows: pd.DataFrame, plan: Experiment) -> bool:
     """Return whether the plan has runs besides those of these rows: `--only` asks for some of them."""
-    seeds = (None if pd.isna(seed) else int(seed) for seed in rows["seed"])
-    there = set(zip(rows["log"], rows["label"], seeds, strict=True))
-    return not {(run.log.name, run.estimator.label, run.seed) for run in plan.runs()} <= there
+    return not {run.key for run in plan.runs()} <= set(run_keys(rows))
 
 
 def _draw_figures(rows: Rows, folder: Path, differences: list[Record]) -> int:

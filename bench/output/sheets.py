@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from ...estimators.interface import OUTLIERS
 from ..metrics.bootstrap import FEWEST_SEEDS
 from ..metrics.floor_ratio import OVER
 from ..metrics.scoring import INNOVATIONS, MEDIAN
 from ..metrics.state_error import BLOCKS
 from ..results.intervals import interval_over_seeds
-from ..results.summary import OUTLIERS, Record, groups
+from ..results.summary import Record, groups
 from .cells import (
     ABSENT,
     ACCURACY,
@@ -207,7 +208,8 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
         "squared errors over their covariance, per degree of freedom: 1 is consistent, more is overconfident",
         f"ANEES: over {seeds} runs, at {times} fixed times; ▲k, ▼k: at k of them above, below the chi-square interval"
         + ("" if seeds >= FEWEST_SEEDS else "; with so few seeds that interval is wide"),
-        "NIS: over all readings that came in time; position within 1, 2, 3 σ: 68, 95, 99.7 % if consistent",
+        ("NIS: over all readings that came in time; " if sensors else "")
+        + "position within 1, 2, 3 σ: 68, 95, 99.7 % if consistent",
     ]
 
     def anees(row: Record, block: str) -> Cell:

@@ -119,6 +119,12 @@ def whole_spec(spec: str | None, seed: int | None) -> str | None:
     return json.dumps({"seed": seed} | json.loads(spec))  # a spec of another seed keeps it
 
 
+def run_keys(rows: pd.DataFrame) -> list[tuple[str, str, int | None]]:
+    """Return log, label and seed of each row, as `Run.key` has them; the seed is None for a recorded log."""
+    seeds = rows["seed"].astype(object).where(rows["seed"].notna(), None)
+    return list(zip(rows["log"], rows["label"], seeds, strict=True))
+
+
 # -- rows that cannot be read -----------------------------------------------------------------------------------------
 
 

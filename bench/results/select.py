@@ -49,8 +49,7 @@ class Stored:
     @cached_property
     def spec(self) -> dict[str, Any]:
         """Everything that the run's numbers depend on, except readings and versions."""
-        seed = self.first["seed"]
-        return json.loads(whole_spec(self.first["spec"], None if seed is None else int(seed)) or "{}")
+        return json.loads(whole_spec(self.first["spec"], self.first["seed"]) or "{}")
 
     @cached_property
     def made_by(self) -> dict[str, Any]:

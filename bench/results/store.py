@@ -18,7 +18,7 @@ from ..errors import ExperimentError
 from ..files import writing
 from .identity import versions
 from .machine import git, machine
-from .rows import COLUMNS, NAMES, OtherColumnsError, Row, check_columns, read_rows, whole_spec
+from .rows import COLUMNS, NAMES, OtherColumnsError, Row, check_columns, read_rows, run_keys, whole_spec
 
 LOCKED_S = 60.0
 """s to wait for a program that writes to the store at this moment: transactions are short."""
@@ -177,8 +177,8 @@ def load_runs(folder: Path | str, shared_specs: bool = False) -> pd.DataFrame:
 
 def with_whole_specs(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows of a store with the seed in each spec."""
-    seeds = [None if pd.isna(seed) else int(seed) for seed in rows["seed"]]
-    return rows.assign(spec=pd.Series(map(whole_spec, rows["spec"], seeds), rows.index, object))
+    specs = (whole_spec(spec, seed) for spec, (_, _, seed) in zip(rows["spec"], run_keys(rows), strict=True))
+    return rows.assign(spec=pd.Series(specs, rows.index, object))
 
 
 @cache

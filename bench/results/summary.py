@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from ...datasets.epochs import IMU_GAP
+from ...estimators.interface import OUTLIERS
 from ..metrics.consistency import anees_of, pooled_nis
 from ..metrics.floor_ratio import OVER, rmse_over_floor
 from ..metrics.pose_error import pooled_rmse
@@ -50,9 +51,6 @@ LONGEST_NAME = 100
 """Letters of a log's name in the name of a file, which has 255 at most, with what it is added to."""
 LARGEST = 1e150
 """Of a score in any unit: its square is finite."""
-
-OUTLIERS = "outliers_"
-"""Prefix of the counts of readings that an estimator rejected, or gave less weight, as outliers."""
 
 
 def records(rows: Rows) -> Records:

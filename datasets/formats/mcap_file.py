@@ -317,7 +317,7 @@ class ProtobufExtractor:
         try:
             message = self._decode(data)
         except Exception as error:  # protobuf's DecodeError, and what its versions raise besides
-            raise MalformedMessage(f"{type(error).__name__}: {error}") from None
+            raise MalformedMessage(one_line(error)) from None
         return [_protobuf_value(message, column, steps, code) for column, steps, code in self._paths]
 
     def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:

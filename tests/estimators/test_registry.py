@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from fathom.estimators import ESTIMATORS, Estimator, create
 from fathom.estimators.registry import EstimatorError, known_estimators, load_estimator
+from packages import distribution
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -52,12 +53,8 @@ def test_what_is_not_known_is_an_error_that_names_it(name: str, options: dict[st
 
 
 def test_a_broken_package_is_named_and_spoils_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "wrecks-1.0.dist-info").mkdir()
-    (tmp_path / "wreck.py").write_text("import no_such_module_here")
-    (tmp_path / "sound.py").write_text("class Sound: pass")
-    (tmp_path / "wrecks-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: wrecks\nVersion: 1.0\n")
     points = "[fathom.estimators]\nwreck = wreck:Wreck\nsound = sound:Sound\n"
-    (tmp_path / "wrecks-1.0.dist-info" / "entry_points.txt").write_text(points)
+    distribution(tmp_path, "wrecks", points, wreck="import no_such_module_here", sound="class Sound: pass")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "sound", raising=False)
     assert {"wreck", "sound", "eskf"} <= set(known_estimators())
@@ -111,12 +108,8 @@ def function():
 
 def install(folder: Path, name: str, source: str, **points: str) -> None:
     """Put a package with these estimators, by their names, into a folder."""
-    info = folder / f"{name}-1.0.dist-info"
-    info.mkdir()
-    (folder / f"{name}.py").write_text(source)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
     lines = [f"{point} = {name}:{what}" for point, what in points.items()]
-    (info / "entry_points.txt").write_text("\n".join(["[fathom.estimators]", *lines]))
+    distribution(folder, name, "\n".join(["[fathom.estimators]", *lines]), **{name: source})
 
 
 @pytest.fixture

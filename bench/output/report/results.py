@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
-from ....datasets.errors import nearest
+from ....datasets.errors import message_of, nearest
 from ...errors import ExperimentError
 from ...experiment.plan import Experiment, plain, shipped_experiments
 from ...files import from_csv, writing
@@ -95,6 +95,6 @@ def differences_of(folder: Path) -> list[Record]:
     try:
         table = pd.read_csv(path, dtype=dict.fromkeys(NAMES, str), keep_default_na=False, na_values=[""])
     except (OSError, ValueError) as error:
-        raise ExperimentError(f"{path}: cannot be read ({' '.join(str(error).split())})") from None
+        raise ExperimentError(f"{path}: cannot be read ({message_of(error)})") from None
     names = {name: table[name].map(from_csv, na_action="ignore") for name in NAMES if name in table}
     return records(table.assign(**names))

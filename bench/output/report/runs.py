@@ -11,6 +11,7 @@ from ...metrics.floor_ratio import FLOORS
 from ...metrics.scoring import COSTS, INNOVATIONS, SCORES
 from ...results.summary import UNFINISHED, Record, groups
 from ..cells import ABSENT, ACCURACY, Cell, against, cell, output_and_lag, spans
+from ..remarks import NO_CAUSE
 from ..sheets import Line, Sheet
 
 ALL_SCORES = (*SCORES, *FLOORS, *INNOVATIONS, *COSTS)
@@ -74,7 +75,7 @@ def failures(rows: Sequence[Record]) -> Sheet | None:
             Cell(spans(seeds) or ABSENT, seeds[0] if seeds else None),
             Cell(str(status), str(status)),
             Cell(when, times[0] if times else None),
-            Cell(cause or "no cause is recorded", cause),
+            Cell(cause or NO_CAUSE, cause),
         ]
         lines.append(Line(log, cells))
     hidden = len(lines) - MOST_CAUSES

@@ -15,7 +15,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from fathom.bench.cli.app import app
-from fathom.bench.cli.list_ import folded
+from fathom.bench.cli.list_ import INDENT
+from fathom.bench.saying import folded
 from fathom.datasets import Trajectory
 from typer.testing import CliRunner
 
@@ -262,7 +263,7 @@ def test_a_choice_that_there_is_not_is_refused_without_pydantics_words() -> None
 
 def test_a_list_is_folded_between_words() -> None:
     line = "estimator: lag_s, smoothed_covariance_s, relinearize, keyframe-period, factors"
-    lines = folded(line, 30).splitlines()
+    lines = folded(line, 30, INDENT).splitlines()
     assert " ".join(part.strip() for part in lines) == line
     assert max(map(len, lines)) <= 30
     assert all(part.startswith("    ") for part in lines[1:])

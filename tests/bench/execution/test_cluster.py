@@ -42,45 +42,19 @@ from fathom.bench.results.identity import content_sha256
 from fathom.bench.results.store import load_runs
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.described.folder import write_folder
+from packages import distribution, idler
 from typer.testing import CliRunner
 
 SHORT: dict[str, Any] = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
-POISON = '''
-import os, signal, time
-from dataclasses import dataclass
-from fathom.datasets import Belief
-from fathom.estimators import FACTORS
-
-@dataclass(frozen=True)
-class Poison:
-    """Stays where it is; at its hundredth epoch it does what `kind` says."""
-
-    kind: str = "none"
-    factors: frozenset[str] = FACTORS
-
-    def begin(self, prior, rig):
-        return Pass(self.kind, prior)
-
-class Pass:
-    def __init__(self, kind, prior):
-        self.kind, self.prior, self.t_ns, self.counts, self.steps = kind, prior, prior.t_ns, {}, 0
-
-    def step(self, epoch):
-        self.t_ns, self.steps = epoch.t_ns, self.steps + 1
-        if self.steps == 100:
-            match self.kind:
-                case "dies": os._exit(3)
-                case "kills": os.kill(os.getppid(), signal.SIGKILL)
-                case "dawdles": time.sleep(1.0)
-        if self.steps > 100 and self.kind == "kills":
-            time.sleep(60)
-
-    def belief(self):
-        return Belief(self.t_ns, self.prior.state, self.prior.P)
-
-    def finish(self):
-        return None
-'''
+POISON = idler("""
+if self.steps == 100:
+    match self.kind:
+        case "dies": os._exit(3)
+        case "kills": os.kill(os.getppid(), signal.SIGKILL)
+        case "dawdles": time.sleep(1.0)
+if self.steps > 100 and self.kind == "kills":
+    time.sleep(60)
+""")
 
 
 def experiment(**changes: Any) -> Experiment:
@@ -96,11 +70,7 @@ def poisoned(*kinds: str) -> list[dict[str, Any]]:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Somebody's package with an estimator `poison`, here and in every process started from here."""
     folder = tmp_path_factory.mktemp("site")
-    info = folder / "poisons-1.0.dist-info"
-    info.mkdir()
-    (folder / "poisons.py").write_text(POISON)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: poisons\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[fathom.estimators]\npoison = poisons:Poison\n")
+    distribution(folder, "poisons", "[fathom.estimators]\npoison = poisons:Idler\n", poisons=POISON)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
         patch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))

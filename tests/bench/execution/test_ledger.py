@@ -39,21 +39,6 @@ def experiment(**changes: Any) -> Experiment:
     return Experiment.from_dict(content, "t.yaml")
 
 
-@pytest.fixture
-def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What was run, by name; in this process, since what is tried here is which runs are made."""
-    names: list[str] = []
-    bench = working.WorkerCache()
-
-    def here(tasks: Any, jobs: int) -> Any:
-        for task in tasks:
-            names.append(str(task.run))
-            yield bench.execute(task)
-
-    monkeypatch.setattr(runner, "run_all", here)
-    return names
-
-
 def test_what_is_done_is_not_done_again_until_forced(tmp_path: Path, ran: list[str]) -> None:
     first = sweep(experiment(seeds=[1, 2]), out=tmp_path)
     assert len(ran) == 2

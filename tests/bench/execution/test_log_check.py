@@ -11,29 +11,12 @@ import pytest
 import yaml
 from fathom.bench import Experiment, ExperimentError, run_experiment
 from fathom.bench.cli.app import app
-from fathom.bench.execution import sweep as runner
-from fathom.bench.execution import worker as working
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.log import ImuStream
 from typer.testing import CliRunner
 
 IN_G = "m/s² strong where gravity is 9.81: it is in g."
-
-
-@pytest.fixture
-def ran(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What was run, by name; in this process."""
-    names: list[str] = []
-    bench = working.WorkerCache()
-
-    def here(tasks: Any, jobs: int) -> Any:
-        for task in tasks:
-            names.append(str(task.run))
-            yield bench.execute(task)
-
-    monkeypatch.setattr(runner, "run_all", here)
-    return names
 
 
 @pytest.fixture

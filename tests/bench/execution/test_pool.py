@@ -18,6 +18,7 @@ from fathom.bench.execution.child import start
 from fathom.bench.execution.pool import Worker, next_finished
 from fathom.bench.execution.task import Finished, Stage, Task
 from fathom.bench.experiment.plan import Experiment
+from packages import distribution, idler
 
 PLAN = Experiment.from_dict(
     {
@@ -184,69 +185,37 @@ def test_a_planned_run_without_a_row_is_an_error(tmp_path: Path, monkeypatch: py
 
 # -- whole runs of other people's estimators --------------------------------------------------------------------------
 
-STRANGE = '''
-import os, signal, sys, threading, time, warnings
-from dataclasses import dataclass
-import numpy as np
-from fathom.datasets import Belief
-from fathom.estimators import FACTORS
-
-@dataclass(frozen=True)
-class Strange:
-    """Stays where it is; at its fifth epoch it does what `kind` says."""
-
-    kind: str = "none"
-    factors: frozenset[str] = FACTORS
-
-    def begin(self, prior, rig):
-        return Pass(self.kind, prior)
-
-class Pass:
-    def __init__(self, kind, prior):
-        self.kind, self.prior, self.t_ns, self.counts, self.steps = kind, prior, prior.t_ns, {}, 0
-
-    def step(self, epoch):
-        self.t_ns, self.steps = epoch.t_ns, self.steps + 1
-        if self.steps != 5:
-            return
-        match self.kind:
-            case "exits": sys.exit(0)
-            case "dies": os._exit(0)
-            case "swallows":
-                while True:
-                    try:
-                        time.sleep(60)
-                    except BaseException:
-                        pass
-            case "forks": os.fork()
-            case "changes":
-                import fathom.estimators.physics.so3, fathom.bench.metrics.absolute_error as absolute
-                absolute.ate = lambda *_, **__: 1 / 0
-                np.seterr(all="raise")
-                np.random.seed(0)
-                os.chdir("/")
-                os.environ["FATHOM_DATA"] = "/nowhere"
-                sys.setrecursionlimit(60 + len(__import__("inspect").stack()))
-                warnings.simplefilter("error")
-                signal.signal(signal.SIGTERM, signal.SIG_IGN)
-                threading.Thread(target=time.sleep, args=(600,)).start()
-
-    def belief(self):
-        return Belief(self.t_ns, self.prior.state, self.prior.P)
-
-    def finish(self):
-        return None
-'''
+STRANGE = idler("""
+if self.steps != 5:
+    return
+match self.kind:
+    case "exits": sys.exit(0)
+    case "dies": os._exit(0)
+    case "swallows":
+        while True:
+            try:
+                time.sleep(60)
+            except BaseException:
+                pass
+    case "forks": os.fork()
+    case "changes":
+        import fathom.estimators.physics.so3, fathom.bench.metrics.absolute_error as absolute
+        absolute.ate = lambda *_, **__: 1 / 0
+        np.seterr(all="raise")
+        np.random.seed(0)
+        os.chdir("/")
+        os.environ["FATHOM_DATA"] = "/nowhere"
+        sys.setrecursionlimit(60 + len(__import__("inspect").stack()))
+        warnings.simplefilter("error")
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        threading.Thread(target=time.sleep, args=(600,)).start()
+""")
 
 
 @pytest.fixture
 def strange(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody's package with an estimator `strange`, here and in the workers."""
-    info = tmp_path / "strangers-1.0.dist-info"
-    info.mkdir()
-    (tmp_path / "strangers.py").write_text(STRANGE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: strangers\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[fathom.estimators]\nstrange = strangers:Strange\n")
+    distribution(tmp_path, "strangers", "[fathom.estimators]\nstrange = strangers:Idler\n", strangers=STRANGE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
 

@@ -21,6 +21,7 @@ from fathom.bench.output.remarks import failures
 from fathom.bench.results.store import load_runs
 from fathom.bench.results.summary import records, summarise
 from fathom.estimators import create
+from packages import distribution
 
 SHORT = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
 PLUGIN = '''
@@ -66,10 +67,7 @@ class Pass:
 def mishap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Install another package with an estimator `mishap`, here and in the workers."""
     site = tmp_path / "site"
-    (site / "mishaps-1.0.dist-info").mkdir(parents=True)
-    (site / "mishaps.py").write_text(PLUGIN)
-    (site / "mishaps-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mishaps\nVersion: 1.0\n")
-    (site / "mishaps-1.0.dist-info" / "entry_points.txt").write_text("[fathom.estimators]\nmishap = mishaps:Mishap\n")
+    distribution(site, "mishaps", "[fathom.estimators]\nmishap = mishaps:Mishap\n", mishaps=PLUGIN)
     monkeypatch.syspath_prepend(str(site))
     monkeypatch.setenv("PYTHONPATH", str(site))
     monkeypatch.delitem(sys.modules, "mishaps", raising=False)

@@ -14,6 +14,7 @@ import yaml
 from fathom.datasets import DatasetError
 from fathom.datasets.described.opening import open_log
 from fathom.datasets.formats.recording import LOADERS, Recording, extra, known_formats, loader, not_found
+from packages import distribution
 
 NOISE = dict.fromkeys(
     ("gyro_density", "accel_density", "gyro_walk", "accel_walk", "gyro_bias_sigma", "accel_bias_sigma"), 1e-3
@@ -70,16 +71,6 @@ class LinesRecording(Recording):
     def contents(self, folder):
         return [TopicInfo("Inertial", "", 10, 1.0, FIELDS["Inertial"], 2)]
 '''
-
-
-def distribution(folder: Path, name: str, points: str, **modules: str) -> None:
-    """A package as pip leaves it: modules, and the metadata beside them."""
-    info = folder / f"{name}-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(points)
-    for module, text in modules.items():
-        (folder / f"{module}.py").write_text(text)
 
 
 @pytest.fixture
