@@ -42,11 +42,10 @@ from fathom.bench.results.identity import content_sha256
 from fathom.bench.results.store import load_runs
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.described.folder import write_folder
-from packages import distribution, idler
 from typer.testing import CliRunner
 
 SHORT: dict[str, Any] = {"scenario": {"mission": "lawnmower", "duration_s": 20}}
-POISON = idler("""
+POISON = """
 if self.steps == 100:
     match self.kind:
         case "dies": os._exit(3)
@@ -54,7 +53,7 @@ if self.steps == 100:
         case "dawdles": time.sleep(1.0)
 if self.steps > 100 and self.kind == "kills":
     time.sleep(60)
-""")
+"""
 
 
 def experiment(**changes: Any) -> Experiment:
@@ -69,8 +68,10 @@ def poisoned(*kinds: str) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Somebody's package with an estimator `poison`, here and in every process started from here."""
+    from packages import distribution, idler  # not above: a cluster's processes import this page, and find no other
+
     folder = tmp_path_factory.mktemp("site")
-    distribution(folder, "poisons", "[fathom.estimators]\npoison = poisons:Idler\n", poisons=POISON)
+    distribution(folder, "poisons", "[fathom.estimators]\npoison = poisons:Idler\n", poisons=idler(POISON))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
         patch.setenv("PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]))
