@@ -11,13 +11,14 @@ from .specs import SENSORS
 TOLD = {
     *("min_range_m", "max_range_m", "max_tilt_deg", "beam_loss_probability", "three_beams"),
     *("reacquisition_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg"),
+    *("velocity_in", "wrong_by_deg"),
 }
-"""Settings of sensors that neither the rig nor the readings show."""
+"""Settings of sensors and of the prior that neither the rig nor the readings nor the prior show."""
 
 
 def scenario_notes(scenario: Scenario) -> list[str]:
     """Return sentences on the world, and on each sensor's settings, delays and faults, where there are any."""
-    parts = (_world, _mountings, _biases, _sensors, _late, _faults)
+    parts = (_world, _mountings, _biases, _sensors, _late, _faults, _prior)
     return [note for part in parts for note in part(scenario)]
 
 
@@ -63,6 +64,11 @@ def _faults(scenario: Scenario) -> list[str]:
         if dials:
             notes.append(f"{sensor} faults: {listed(dials)}.")
     return notes
+
+
+def _prior(scenario: Scenario) -> list[str]:
+    dials = {name: value for name, value in changed(scenario.prior).items() if name in TOLD}
+    return [f"prior: {listed(dials)}."] if dials else []
 
 
 def changed(spec: Any) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..errors import DatasetError
@@ -61,6 +63,12 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
 def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
     """Return the belief at the start: its mean is the truth less one draw of the error that its P states.
 
+    The draw xi is made in the coordinates in which the sigmas are independent. With C the axes of the attitude's (W
+    where a heading has its own, else B), and u the velocity in B where it is known there:
+
+        R_true = R Exp(theta)    theta = R_CB xi_theta    v_true = R_true u_true    u_true = u + xi_v
+        e_v = R (xi_v − u × theta), to first order, as P states it
+
     The biases' means are zero: their errors were drawn at turn-on.
     """
     noise, prior = scenario.imu.figures, scenario.prior
@@ -70,7 +78,22 @@ def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
     sigma[VELOCITY] = prior.velocity_m_s
     sigma[ACCEL_BIAS] = noise.accel_bias_sigma
     sigma[GYRO_BIAS] = noise.gyro_bias_sigma
-    state = truth.state(0)
-    error = random_stream(seed, "prior").standard_normal(DIM) * sigma * scenario.noise_scale
+    if prior.heading_deg is not None:
+        sigma[THETA] = np.array([prior.attitude_deg, prior.attitude_deg, prior.heading_deg]) * DEGREE
+    state, random = truth.state(0), random_stream(seed, "prior")
+    error = random.standard_normal(DIM) * sigma * scenario.noise_scale
+    if prior.wrong_by_deg is not None:
+        axis = random.standard_normal(3)
+        error[THETA] = prior.wrong_by_deg * DEGREE * axis / np.linalg.norm(axis)
+    if prior.heading_deg is not None:
+        error[THETA] = state.R_WB.T @ error[THETA]
     error[ACCEL_BIAS], error[GYRO_BIAS] = state.b_a, state.b_g
-    return Belief(int(truth.t_ns[0]), state.retract(-error), np.diag(sigma**2))
+    mean, to_error = state.retract(-error), np.eye(DIM)
+    if prior.heading_deg is not None:
+        to_error[THETA, THETA] = mean.R_WB.T
+    if prior.velocity_in == "B":
+        u_WB_B = state.R_WB.T @ state.v_WB_W - error[VELOCITY]
+        mean = replace(mean, v_WB_W=mean.R_WB @ u_WB_B)
+        to_error[VELOCITY, THETA] = mean.R_WB @ np.cross(to_error[THETA, THETA].T, u_WB_B).T
+        to_error[VELOCITY, VELOCITY] = mean.R_WB
+    return Belief(int(truth.t_ns[0]), mean, to_error @ np.diag(sigma**2) @ to_error.T)

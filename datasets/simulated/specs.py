@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 from pydantic.dataclasses import dataclass
@@ -189,8 +189,19 @@ SENSORS = ("dvl", "depth", "gps", "heading")
 
 @dataclass(frozen=True, config=STRICT)
 class PriorSpec:
-    """Standard deviations of the belief at the start; those of the biases are the IMU's at turn-on."""
+    """Standard deviations of the belief at the start; those of the biases are the IMU's at turn-on.
 
-    attitude_deg: Positive = 0.5  # each of the three axes of B
+    Attributes:
+        attitude_deg: of each axis of B; of the two horizontal axes of W alone where heading_deg is given.
+        heading_deg: about W's vertical; None: as attitude_deg.
+        velocity_in: the axes in which the velocity is known. In "B" a vehicle knows how fast it moves, and not
+            whereto: an error of attitude turns its velocity in W as well.
+        wrong_by_deg: by how much the attitude is wrong, about a random axis; None: by a draw from its sigmas.
+    """
+
+    attitude_deg: Positive = 0.5
+    heading_deg: Annotated[Positive, Field(le=180)] | None = None
     position_m: Positive = 1.0
     velocity_m_s: Positive = 0.05
+    velocity_in: Literal["W", "B"] = "W"
+    wrong_by_deg: Annotated[NotNegative, Field(le=180)] | None = None
