@@ -50,7 +50,7 @@ def tracks_of(rows: Sequence[Record], folder: Path, missing: list[str] | None = 
 
 
 def _readable(row: Record, folder: Path, missing: list[str] | None) -> Track | None:
-    """Return the track of a row; None where it has no score, or cannot be read."""
+    """Return the track of a row; None where it has no state or no score, or cannot be read."""
     try:
         return _track(row, folder)
     except (OSError, ValueError, KeyError) as error:  # a truncated file, or not one of ours
@@ -62,6 +62,8 @@ def _readable(row: Record, folder: Path, missing: list[str] | None) -> Track | N
 
 def _track(row: Record, folder: Path) -> Track | None:
     estimate = load_trajectory(folder / row["trajectory"])
+    if not len(estimate):  # the run ended before its first state, as where a smoother refuses its start
+        return None
     truth = row["truth_trajectory"]
     if truth is None or not (folder / truth).is_file():
         return Track(row["label"], row["output"], "none", None, estimate)

@@ -84,6 +84,14 @@ def test_the_tracks_have_equal_axes_and_the_truth(rows: pd.DataFrame, folder: Pa
     assert np.array_equal(axes.lines[0].get_xydata(), tracks[0].truth.p_WB_W[:, :2])
 
 
+def test_a_run_that_ended_before_its_first_state_has_no_track(rows: pd.DataFrame, folder: Path, tmp_path: Path) -> None:
+    row = next(row for row in records(rows) if row["trajectory"] is not None) | {"truth_trajectory": None}
+    whole = pd.read_parquet(folder / "trajectories" / row["trajectory"])
+    for n, found in ((len(whole), 1), (0, 0)):
+        whole.iloc[:n].to_parquet(tmp_path / row["trajectory"])
+        assert len(tracks_of([row], tmp_path)[0]) == found
+
+
 def test_a_track_that_got_lost_does_not_set_the_scale(rows: pd.DataFrame, folder: Path) -> None:
     tracks, _ = tracks_of(records(rows), folder / "trajectories")
     before = draw_tracks(tracks, looks_of(LABELS), "t").axes[0].get_xlim()
