@@ -10,11 +10,13 @@ from matplotlib.figure import Figure
 
 from ....datasets.errors import one_line
 from ...drawing import Look, looks_of, save
+from ...results.honesty import compared, honesty
 from ...results.summary import Record, Rows, file_names, groups, records, summarise
 from ..estimates import tracks_of
 from .ablation import draw_ablation
 from .consistency import draw_nees
 from .cost import draw_costs, priced
+from .honesty import draw_honesty
 from .lag import draw_lag_curve, lag_curve
 from .step_time import draw_step_times, step_times
 from .track import draw_errors, draw_tracks, pages_of
@@ -81,6 +83,8 @@ def _figures(rows: Rows, folder: Path, differences: Sequence[Record], missing: l
         found.append((Path(f"{stems[log]}-ablation"), partial(draw_ablation, of_log, looks, log)))
     if to_price := priced(summary):
         found.append((folder / "figures" / "accuracy-cost", partial(draw_costs, to_price, looks)))
+    if honest := compared(honesty(every)):
+        found.append((folder / "figures" / "honesty", partial(draw_honesty, honest, looks)))
     return found
 
 

@@ -15,12 +15,13 @@ from rich.text import Text
 
 from ...files import write_csv
 from ...metrics.scoring import by_reason
+from ...results.honesty import HONESTY
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, Rows, groups, is_judged, records, summarise
 from ...results.summary import consistency as consistency_of
 from ...saying import folded
-from .. import notices, sheets
+from .. import notices, over_logs, sheets
 from ..cells import Cell
 from ..remarks import failures, mostly_outside, not_positive
 from . import terminal
@@ -43,6 +44,12 @@ def write_consistency(rows: Rows, path: Path) -> None:
 def write_paired(differences: Sequence[Record], path: Path) -> None:
     """Write what `paired` returns as CSV."""
     write_csv(pd.DataFrame(differences, columns=list(PAIRED)), path)
+
+
+def write_honesty(found: Sequence[Record], path: Path) -> None:
+    """Write what `results.honesty.honesty` returns as CSV; a log is a regime there."""
+    table = pd.DataFrame(found, columns=list(HONESTY)).astype(dict.fromkeys(("above", "below", "times"), "Int64"))
+    write_csv(table.rename(columns={"log": "regime", "label": "estimator"}), path)
 
 
 def print_table(rows: Rows, console: Console | None = None, differences: Sequence[Record] = ()) -> None:
@@ -74,6 +81,13 @@ def print_differences(differences: Sequence[Record], console: Console) -> None:
     found = sheets.differences(differences)
     for sheet in found:
         print_sheet(sheet, console, noted=sheet is found[-1])
+
+
+def print_honesty(found: Sequence[Record], console: Console) -> None:
+    """Print ANEES of all logs in one table, where there are several and seeds are enough."""
+    sheet = over_logs.honesty(found)
+    if sheet is not None:
+        print_sheet(sheet, console)
 
 
 def print_remarks(rows: Rows, console: Console) -> None:

@@ -19,6 +19,7 @@ import pytest
 from fathom.bench.execution.reference import (
     COLUMNS,
     LEFT_OUT,
+    LOGS_LEFT_OUT,
     SHORT,
     SHORT_RECORDED,
     reference_table,
@@ -111,7 +112,9 @@ def test_every_shipped_experiment_has_a_reference_of_all_its_estimators(name: st
     left_out = LEFT_OUT.get(name, ())
     assert short.estimators == tuple(each for each in whole.estimators if each.label not in left_out)
     assert set(left_out) <= {each.label for each in whole.estimators}
-    assert {log.name for log in whole.logs} - {log.name for log in short.logs} <= {
+    logs_left_out = set(LOGS_LEFT_OUT.get(name, ()))
+    assert logs_left_out <= {log.name for log in whole.logs}
+    assert {log.name for log in whole.logs} - {log.name for log in short.logs} - logs_left_out <= {
         log.name for log in whole.logs if log.scenario is None
     }
     assert set(expected) <= set(COLUMNS)

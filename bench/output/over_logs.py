@@ -1,0 +1,61 @@
+"""Tables over all logs of an experiment, in groups of lines: each log's name, and below it the estimators'."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from ..metrics.state_error import BLOCKS, DOF
+from ..results.honesty import band_of, compared
+from ..results.summary import Record, groups
+from .cells import ABSENT, ONLINE, Cell, interval, lag, text
+from .sheets import SHORT, Line, Sheet
+
+INDENT = "  "
+"""Before an estimator's name, below that of the log."""
+FINISHED = (
+    f"a time or `all` beside a name: smoothed, with that look-ahead; k/n: of n runs k finished; {ABSENT}: none did"
+)
+
+
+def honesty(found: Sequence[Record]) -> Sheet | None:
+    """Return ANEES by log, estimator and block, of what `results.honesty` found; None where there is too little."""
+    shown = compared(found)
+    if not shown:
+        return None
+    seeds, times = (max(row[name] or 0 for row in shown) for name in ("seeds", "times"))
+    bands = dict.fromkeys(
+        f"{interval(*band)} of {DOF[block]} states" for block in BLOCKS if (band := band_of(shown, block)) is not None
+    )
+    note = [
+        f"mean over {times} fixed times of the ANEES over {seeds} seeds, per degree of freedom: 1 is consistent",
+        "▲k, ▼k: at k of these times above (overconfident), below the band that 99 % of consistent ones never leave:",
+        f"{', '.join(bands)}",
+        FINISHED,
+    ]
+
+    def cells(of: Sequence[Record]) -> list[Cell]:
+        by_block = {row["block"]: row for row in of}
+        return [_anees(by_block[block]) for block in BLOCKS]
+
+    headings = ["estimator", *(SHORT.get(block, block) for block in BLOCKS)]
+    return Sheet("honesty: ANEES", note, headings, _grouped(shown, cells, len(BLOCKS)))
+
+
+def _anees(row: Record) -> Cell:
+    if row["anees"] is None:
+        return Cell(ABSENT)
+    mark = (f"▲{row['above']}" if row["above"] else "") + (f"▼{row['below']}" if row["below"] else "")
+    return Cell(text(row["anees"]), row["anees"], mark=mark)
+
+
+def _grouped(rows: Sequence[Record], cells: Callable[[Sequence[Record]], list[Cell]], columns: int) -> list[Line]:
+    """Return a line for each output, below a line with the name of its log."""
+    lines = []
+    for (log,), of_log in groups(rows, "log").items():
+        lines.append(Line(log, [Cell("")] * columns))
+        for (label, _), of in groups(of_log, "label", "output").items():
+            row = of[0]
+            name = label if row["output"] == ONLINE else f"{label}, {lag(row['lookahead_s'])}"
+            part = "" if row["seeds"] == row["runs"] else f" {row['seeds']}/{row['runs']}"
+            lines.append(Line(f"{INDENT}{name}{part}", cells(of)))
+    return lines

@@ -1,0 +1,83 @@
+"""Honesty: ANEES of every log, estimator, output and block, as a mean over its fixed times, and who leaves the band."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..metrics.consistency import Average, anees_of, interval
+from ..metrics.state_error import BLOCKS, Block
+from .summary import SEEDS_ENOUGH, Record, Rows, groups, records
+
+FALSE_ALARM = 0.01
+"""Probability that a consistent estimator leaves the band of a block at any of the fixed times: 99 % stay inside."""
+FEWEST_LOGS = 2
+"""One log has its own table of consistency."""
+
+HONESTY = (
+    *("log", "label", "output", "lookahead_s", "block", "anees", "low", "high"),
+    *("above", "below", "times", "seeds", "runs"),
+)
+
+
+def honesty(rows: Rows) -> list[Record]:
+    """Return one record per log, estimator, output and block, in the order of the rows; HONESTY names its fields.
+
+    `anees` is the mean over the fixed times of `metrics.consistency`, per degree of freedom: 1 is consistent. At each
+    time a consistent estimator lies in the band from `low` to `high` with probability 1 − FALSE_ALARM / `times`, by
+    docs/conventions.md (55). `above` and `below` count the times outside. `seeds` of `runs` finished; the numbers are
+    None where none did, or where an output has no covariance.
+
+    A band holds for one number of seeds; where it differs between times, `low` and `high` are the widest.
+    """
+    found = []
+    every = groups(records(rows), "log", "label")
+    for (log, label), of_label in every.items():
+        runs = len(groups(of_label, "seed"))
+        for (output,), of in groups(of_label, "output").items():
+            done = [row for row in of if row["status"] == "done"]
+            ahead = next((row["lookahead_s"] for row in of if row["lookahead_s"] is not None), None)
+            averages = anees_of([row["nees_at"] for row in done])
+            for block in BLOCKS:
+                record = {"log": log, "label": label, "output": output, "lookahead_s": ahead, "block": block}
+                found.append(record | _judged(averages.get(block)) | {"seeds": len(done), "runs": runs})
+    return found
+
+
+def _judged(average: Average | None) -> Record:
+    """Return the mean of an ANEES over its times, its band, and how many times are outside."""
+    if average is None:
+        return dict.fromkeys(("anees", "low", "high", "above", "below", "times"))
+    low, high = interval(average.dof, 1.0 - FALSE_ALARM / len(average))
+    return {
+        "anees": float(average.value.mean()),
+        "low": float(low.min()),
+        "high": float(high.max()),
+        "above": int(np.sum(average.value > high)),
+        "below": int(np.sum(average.value < low)),
+        "times": len(average),
+    }
+
+
+def compared(found: list[Record]) -> list[Record]:
+    """Return the records that a table or a figure of several logs shows; none where seeds or logs are too few.
+
+    What a smoother over the whole log says during the log is left out: it is a filter's, or a first guess.
+    """
+    logs = {row["log"] for row in found if row["anees"] is not None and row["seeds"] >= SEEDS_ENOUGH}
+    if len(logs) < FEWEST_LOGS:
+        return []
+    whole = {(row["log"], row["label"]) for row in found if row["lookahead_s"] == math.inf}
+    return [
+        row
+        for row in found
+        if row["log"] in logs and ((row["log"], row["label"]) not in whole or row["lookahead_s"] == math.inf)
+    ]
+
+
+def band_of(found: list[Record], block: Block) -> tuple[float, float] | None:
+    """Return the band of a block for the most seeds that any record has; None where there is none."""
+    known = [row for row in found if row["block"] == block and row["low"] is not None]
+    best = max(known, key=lambda row: row["seeds"], default=None)
+    return None if best is None else (best["low"], best["high"])
