@@ -35,7 +35,7 @@ SHORT = {
 }
 """What a mission has at most of each, so that it still goes down, turns and comes up; outages keep their share."""
 
-SHORT_SEEDS = {"relinearisation": 1, "delays": 1, "cost": 1, "honesty": 1}
+SHORT_SEEDS = {"relinearisation": 1, "delays": 1, "cost": 1, "honesty": 1, "initial_error": 1}
 """How many of an experiment's seeds, the first ones; two if not listed."""
 
 LEFT_OUT = {
@@ -44,7 +44,10 @@ LEFT_OUT = {
 }
 """Labels whose runs would take as long as all the others: they solve whole logs, or long windows, again and again."""
 
-LOGS_LEFT_OUT = {"honesty": ("heading unknown 60°", "an hour, one surfacing")}
+LOGS_LEFT_OUT = {
+    "honesty": ("heading unknown 60°", "an hour, one surfacing"),
+    "initial_error": tuple(f"wrong by {angle}°" for angle in (60, 90, 120, 150, 180)),
+}
 """Logs that are not for a comparison to 1e-6, as estimators refuse the start, or a rounding decides where they end; and
 those that are no other mission when they are short."""
 

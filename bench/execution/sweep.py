@@ -35,7 +35,8 @@ FIRST_SHARE = 0.1
 """An experiment's first log goes first where its runs are at most this share of the work, so that its table is there
 early. It costs little: the longest of the other runs begin a tenth of the time later at most."""
 
-WRITTEN = ("table.csv", "table.tex", "consistency.csv", "honesty.csv", "paired.csv", "report.html")
+TABLES = ("table.csv", "table.tex", "consistency.csv", "honesty.csv", "convergence.csv", "paired.csv")
+WRITTEN = (*TABLES, "report.html")
 """Files that `fathom run` writes into the folder of an experiment, again each time."""
 
 LINE_EVERY_S = 10.0

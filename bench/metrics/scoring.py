@@ -19,6 +19,7 @@ from ...datasets.trajectory import Trajectory
 from .absolute_error import ate, drift, horizontal_error, outage_drift
 from .alignment import Alignment, align
 from .association import ScoreError, associate
+from .convergence import converged_s
 from .floor_ratio import FLOORS
 from .pose_error import Dims
 from .relative_error import Pairs, Unit, check_step, rpe, segment_errors
@@ -56,6 +57,7 @@ SCORES = {
     "within_1sigma_all": "share of all 15 components with an error of at most 1 σ; 0.683 if consistent",
     "within_2sigma_all": "the same within 2 σ; 0.954 if consistent",
     "within_3sigma_all": "the same within 3 σ; 0.997 if consistent",
+    "converged_s": "when the attitude's error falls below `converged_deg` for good, s; where that is stated",
     "n_not_positive": "poses whose covariance is not positive definite; these have no NEES",
 }
 
@@ -93,6 +95,7 @@ class Scoring:
         nees_epochs: number of evenly spaced times at which NEES is averaged over seeds (see `consistency`).
         nis: take the NIS of innovations, see `run_log`; costs are then not comparable.
         floor: compute the posterior Cramér–Rao bound of every output, for simulated logs, unaligned and in 3d.
+        converged_deg: an attitude's error that stays below it has converged, see `fathom.bench.metrics.convergence`.
     """
 
     align: Alignment = "none"
@@ -105,6 +108,7 @@ class Scoring:
     nees_epochs: Annotated[Whole, Field(ge=1, le=1000)] = 10
     nis: bool = False
     floor: bool = False
+    converged_deg: Annotated[Positive, Field(le=180)] | None = None
 
     @model_validator(mode="after")
     def _step_is_possible(self) -> Scoring:
@@ -298,6 +302,14 @@ def _horizontal(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scor
     return {"cep50_m": e.cep50_m, "drms_m": e.drms_m}
 
 
+def _converged(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
+    if scoring.converged_deg is None:
+        return {"converged_s": "not asked for: `converged_deg` among the scores states below which error"}
+    if scoring.align != "none":
+        return {"converged_s": "convergence is judged unaligned"}
+    return {"converged_s": converged_s(truth, estimate, scoring.converged_deg)}
+
+
 NO_COVARIANCE = "no pose has a covariance and a known error"
 ALIGNED: dict[Callable[..., Found], tuple[str, ...]] = {
     _absolute: ("ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_max_m", "rotation_rmse_deg", "heading_rmse_deg"),
@@ -311,6 +323,7 @@ ANYWAY: dict[Callable[..., Found], tuple[str, ...]] = {
     _biases: ("accel_bias_rmse_m_s2", "gyro_bias_rmse_rad_s"),
     _relative: ("rpe_rmse_m", "rpe_rotation_rmse_deg", "n_rpe"),
     _segments: ("segment_percent", "segment_deg_m"),
+    _converged: ("converged_s",),
 }
 """Those that it does not change."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from ..metrics.state_error import BLOCKS, DOF
+from ..results.convergence import JUDGED
 from ..results.honesty import band_of, compared
 from ..results.summary import Record, groups
 from .cells import ABSENT, ONLINE, Cell, interval, lag, text
@@ -41,6 +42,30 @@ def honesty(found: Sequence[Record]) -> Sheet | None:
     return Sheet("honesty: ANEES", note, headings, _grouped(shown, cells, len(BLOCKS)))
 
 
+def convergence(found: Sequence[Record]) -> Sheet | None:
+    """Return what `results.convergence` found; None where convergence was not asked for."""
+    if not found:
+        return None
+    limits = ", ".join(f"{limit:g}°" for limit in sorted({row["limit_deg"] for row in found}))
+    note = [
+        f"converged: the attitude's error stays below {limits} to the end; of all runs, [ ]: 95 % interval (Wilson)",
+        "time (median), ATE and ANEES are of the runs that converge; ANEES per degree of freedom: 1 is consistent",
+        f"a time or `all` beside a name: smoothed, with that look-ahead; {ABSENT}: no run converged",
+    ]
+
+    def cells(of: Sequence[Record]) -> list[Cell]:
+        (row,) = of
+        share = f"{row['converged']}/{row['runs']}"
+        numbers = [row[name] for name in ("median_s", "ate_rmse_m", *(f"anees_{block}" for block in JUDGED))]
+        return [
+            Cell(share, row["share"], interval(100 * row["low"], 100 * row["high"], "{:.0f} %".format)),
+            *(Cell(ABSENT) if number is None else Cell(text(number), number) for number in numbers),
+        ]
+
+    headings = ["estimator", "converged", "time\ns", "ATE\nm", *(f"ANEES\n{SHORT.get(b, b)}" for b in JUDGED)]
+    return Sheet("convergence", note, headings, _grouped(found, cells, len(headings) - 1))
+
+
 def _anees(row: Record) -> Cell:
     if row["anees"] is None:
         return Cell(ABSENT)
@@ -56,6 +81,6 @@ def _grouped(rows: Sequence[Record], cells: Callable[[Sequence[Record]], list[Ce
         for (label, _), of in groups(of_log, "label", "output").items():
             row = of[0]
             name = label if row["output"] == ONLINE else f"{label}, {lag(row['lookahead_s'])}"
-            part = "" if row["seeds"] == row["runs"] else f" {row['seeds']}/{row['runs']}"
+            part = "" if row.get("seeds", row["runs"]) == row["runs"] else f" {row['seeds']}/{row['runs']}"
             lines.append(Line(f"{INDENT}{name}{part}", cells(of)))
     return lines

@@ -8,10 +8,9 @@ from pathlib import Path
 import pandas as pd
 from rich.console import Console
 
-from ..execution.sweep import Outcome, outdated, rows_of
+from ..execution.sweep import TABLES, Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
 from ..files import writing
-from ..results.honesty import honesty
 from ..results.paired import paired
 from ..results.rows import run_keys
 from ..results.store import load_runs
@@ -22,11 +21,11 @@ from .tables import terminal
 from .tables.latex import write_latex
 from .tables.table import (
     print_differences,
-    print_honesty,
     print_logs,
+    print_over_logs,
     print_remarks,
     write_consistency,
-    write_honesty,
+    write_over_logs,
     write_paired,
     write_table,
 )
@@ -70,17 +69,16 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     print_logs(Records(row for row in made if row["log"] not in printed) if printed else made, console)
     differences = paired(every, plan.comparisons(), plan.compare)
     print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
-    honest = honesty(every)
-    print_honesty([row for row in honest if (row["log"], row["label"]) in shown], console)
+    print_over_logs(made, console)
     print_remarks(made, console)
     with writing(folder, "; the runs are in runs.sqlite"):
         write_table(every, folder / "table.csv")
         write_latex(every, folder / "table.tex")
         write_consistency(every, folder / "consistency.csv")
-        write_honesty(honest, folder / "honesty.csv")
+        write_over_logs(every, folder)
         write_paired(differences, folder / "paired.csv")
         figures = _draw_figures(every, folder, differences)
-    say(f"{folder}: runs.sqlite, table.csv, table.tex, consistency.csv, honesty.csv, paired.csv, {figures} figures")
+    say(f"{folder}: runs.sqlite, {', '.join(TABLES)}, {figures} figures")
     _write_report(every, plan, folder, differences)
     if outcome.standing:
         say(f"{outcome.standing} runs were finished already; --force repeats them")

@@ -10,11 +10,13 @@ from matplotlib.figure import Figure
 
 from ....datasets.errors import one_line
 from ...drawing import Look, looks_of, save
+from ...results.convergence import convergence
 from ...results.honesty import compared, honesty
 from ...results.summary import Record, Rows, file_names, groups, records, summarise
 from ..estimates import tracks_of
 from .ablation import draw_ablation
 from .consistency import draw_nees
+from .convergence import draw_convergence
 from .cost import draw_costs, priced
 from .honesty import draw_honesty
 from .lag import draw_lag_curve, lag_curve
@@ -85,6 +87,8 @@ def _figures(rows: Rows, folder: Path, differences: Sequence[Record], missing: l
         found.append((folder / "figures" / "accuracy-cost", partial(draw_costs, to_price, looks)))
     if honest := compared(honesty(every)):
         found.append((folder / "figures" / "honesty", partial(draw_honesty, honest, looks)))
+    if converged := convergence(every):
+        found.append((folder / "figures" / "convergence", partial(draw_convergence, converged, looks)))
     return found
 
 

@@ -15,7 +15,8 @@ from rich.text import Text
 
 from ...files import write_csv
 from ...metrics.scoring import by_reason
-from ...results.honesty import HONESTY
+from ...results.convergence import CONVERGENCE, convergence
+from ...results.honesty import HONESTY, honesty
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, Rows, groups, is_judged, records, summarise
@@ -28,6 +29,9 @@ from . import terminal
 
 LETTERS = 80
 """Longest line of what the runs noticed, also where there is more room: longer ones are hard to read."""
+
+COUNTS = ("above", "below", "times", "seeds", "runs", "converged")
+"""Columns of counts, which have no decimals where one is absent."""
 
 
 def write_table(rows: Rows, path: Path) -> None:
@@ -46,9 +50,15 @@ def write_paired(differences: Sequence[Record], path: Path) -> None:
     write_csv(pd.DataFrame(differences, columns=list(PAIRED)), path)
 
 
-def write_honesty(found: Sequence[Record], path: Path) -> None:
-    """Write what `results.honesty.honesty` returns as CSV; a log is a regime there."""
-    table = pd.DataFrame(found, columns=list(HONESTY)).astype(dict.fromkeys(("above", "below", "times"), "Int64"))
+def write_over_logs(rows: Rows, folder: Path) -> None:
+    """Write honesty.csv and convergence.csv."""
+    _write_over_logs(honesty(rows), HONESTY, folder / "honesty.csv")
+    _write_over_logs(convergence(rows), CONVERGENCE, folder / "convergence.csv")
+
+
+def _write_over_logs(found: Sequence[Record], columns: Sequence[str], path: Path) -> None:
+    """Write what `results.honesty` or `results.convergence` found as CSV; a log is a regime there."""
+    table = pd.DataFrame(found, columns=list(columns)).astype(dict.fromkeys({*COUNTS} & {*columns}, "Int64"))
     write_csv(table.rename(columns={"log": "regime", "label": "estimator"}), path)
 
 
@@ -83,11 +93,11 @@ def print_differences(differences: Sequence[Record], console: Console) -> None:
         print_sheet(sheet, console, noted=sheet is found[-1])
 
 
-def print_honesty(found: Sequence[Record], console: Console) -> None:
-    """Print ANEES of all logs in one table, where there are several and seeds are enough."""
-    sheet = over_logs.honesty(found)
-    if sheet is not None:
-        print_sheet(sheet, console)
+def print_over_logs(rows: Rows, console: Console) -> None:
+    """Print ANEES of all logs in one table, where there are several and seeds are enough, and who converged."""
+    for sheet in (over_logs.honesty(honesty(rows)), over_logs.convergence(convergence(rows))):
+        if sheet is not None:
+            print_sheet(sheet, console)
 
 
 def print_remarks(rows: Rows, console: Console) -> None:
