@@ -12,7 +12,7 @@ PYTEST := $(BIN)/python -m pytest -q -n auto --dist worksteal
 # Python keeps the bytecode it compiles, whatever the shell says: dozens of processes read the same sources
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: bench test fast timing reference lint types warm pins lowest clean
+.PHONY: bench test fast timing reference honesty lint types warm pins lowest clean
 
 bench: .venv/core
 	$(BIN)/fathom run filter_vs_smoother $(if $(DATA),--data $(DATA))
@@ -31,6 +31,16 @@ timing: .venv/dev
 # results/reference/*.csv anew; recorded logs among them where FATHOM_DATA has them
 reference: .venv/core
 	$(if $(DATA),FATHOM_DATA=$(DATA)) $(BIN)/python -m fathom.bench.execution.reference
+
+# README's figures of honesty and of wrong starts, and their tables: twenty minutes on two cores. A start that is refused is
+# a run that failed, so fathom's status is 1
+honesty: .venv/core
+	$(BIN)/fathom run honesty || test $$? = 1
+	$(BIN)/fathom run initial_error || test $$? = 1
+	cp results/honesty/honesty.csv results/reference/full/honesty.csv
+	cp results/initial_error/convergence.csv results/reference/full/initial_error.csv
+	cp results/honesty/figures/honesty.png docs/honesty.png
+	cp results/initial_error/figures/convergence.png docs/initial-error.png
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -11,6 +11,8 @@ from rich.console import Console
 from ..execution.sweep import TABLES, Outcome, outdated, rows_of
 from ..experiment.plan import Experiment
 from ..files import writing
+from ..results.convergence import convergence
+from ..results.honesty import honesty
 from ..results.paired import paired
 from ..results.rows import run_keys
 from ..results.store import load_runs
@@ -69,15 +71,17 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     print_logs(Records(row for row in made if row["log"] not in printed) if printed else made, console)
     differences = paired(every, plan.comparisons(), plan.compare)
     print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
-    print_over_logs(made, console)
+    honest, converged = honesty(every), convergence(every)
+    over_logs = ([row for row in found if (row["log"], row["label"]) in shown] for found in (honest, converged))
+    print_over_logs(*over_logs, console)
     print_remarks(made, console)
     with writing(folder, "; the runs are in runs.sqlite"):
         write_table(every, folder / "table.csv")
         write_latex(every, folder / "table.tex")
         write_consistency(every, folder / "consistency.csv")
-        write_over_logs(every, folder)
+        write_over_logs(honest, converged, folder)
         write_paired(differences, folder / "paired.csv")
-        figures = _draw_figures(every, folder, differences)
+        figures = _draw_figures(every, folder, differences, honest)
     say(f"{folder}: runs.sqlite, {', '.join(TABLES)}, {figures} figures")
     _write_report(every, plan, folder, differences)
     if outcome.standing:
@@ -95,7 +99,7 @@ def _lacks_runs(rows: pd.DataFrame, plan: Experiment) -> bool:
     return not {run.key for run in plan.runs()} <= set(run_keys(rows))
 
 
-def _draw_figures(rows: Rows, folder: Path, differences: list[Record]) -> int:
+def _draw_figures(rows: Rows, folder: Path, differences: list[Record], honest: list[Record]) -> int:
     """Draw all figures and return how many files they are; matplotlib takes a second to load, so it waits till here."""
     with Console(stderr=True).status("drawing figures") as status:
         from .figures.figures import draw_figures
@@ -104,7 +108,7 @@ def _draw_figures(rows: Rows, folder: Path, differences: list[Record]) -> int:
             status.update(f"drawing figures: {done} of {total}")
 
         missing: list[str] = []
-        files = draw_figures(rows, folder, differences, tell, missing)
+        files = draw_figures(rows, folder, differences, tell, missing, honest)
     for sentence in missing:
         say(f"{folder}: {sentence}")
     return len(files)

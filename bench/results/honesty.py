@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def _judged(average: Average | None) -> Record:
     }
 
 
-def compared(found: list[Record]) -> list[Record]:
+def compared(found: Sequence[Record]) -> list[Record]:
     """Return the records that a table or a figure of several logs shows; none where seeds or logs are too few.
 
     What a smoother over the whole log says during the log is left out: it is a filter's, or a first guess.
@@ -76,7 +77,7 @@ def compared(found: list[Record]) -> list[Record]:
     ]
 
 
-def band_of(found: list[Record], block: Block) -> tuple[float, float] | None:
+def band_of(found: Sequence[Record], block: Block) -> tuple[float, float] | None:
     """Return the band of a block for the most seeds that any record has; None where there is none."""
     known = [row for row in found if row["block"] == block and row["low"] is not None]
     best = max(known, key=lambda row: row["seeds"], default=None)

@@ -32,6 +32,7 @@ def draw_figures(
     differences: Sequence[Record] = (),
     tell: Tell = lambda done, total: None,
     missing: list[str] | None = None,
+    honest: Sequence[Record] | None = None,
 ) -> list[Path]:
     """Draw every figure of an experiment into folder/figures and return the files; a figure without data is left out.
 
@@ -41,12 +42,13 @@ def draw_figures(
         differences: what `paired` found.
         tell: called before each figure, with how many are drawn of how many.
         missing: gets a sentence for each figure that cannot be drawn, and each trajectory that cannot be read.
+        honest: what `results.honesty.honesty` finds in the rows, where that is known already.
 
     Raises:
         OSError: a file cannot be written.
     """
     missing = [] if missing is None else missing
-    figures = _figures(rows, folder, differences, missing)
+    figures = _figures(rows, folder, differences, missing, honesty(rows) if honest is None else honest)
     files = []
     for k, (path, draw) in enumerate(figures):
         tell(k, len(figures))
@@ -63,7 +65,9 @@ Found = list[tuple[Path, Callable[[], Figure]]]
 """The path of each figure, without suffix, and the function that draws it."""
 
 
-def _figures(rows: Rows, folder: Path, differences: Sequence[Record], missing: list[str]) -> Found:
+def _figures(
+    rows: Rows, folder: Path, differences: Sequence[Record], missing: list[str], honest: Sequence[Record]
+) -> Found:
     """Return each figure that has data; what cannot be read is a sentence in `missing`."""
     every = records(rows)
     summary = summarise(every)
@@ -85,8 +89,8 @@ def _figures(rows: Rows, folder: Path, differences: Sequence[Record], missing: l
         found.append((Path(f"{stems[log]}-ablation"), partial(draw_ablation, of_log, looks, log)))
     if to_price := priced(summary):
         found.append((folder / "figures" / "accuracy-cost", partial(draw_costs, to_price, looks)))
-    if honest := compared(honesty(every)):
-        found.append((folder / "figures" / "honesty", partial(draw_honesty, honest, looks)))
+    if over_logs := compared(honest):
+        found.append((folder / "figures" / "honesty", partial(draw_honesty, over_logs, looks)))
     if converged := convergence(every):
         found.append((folder / "figures" / "convergence", partial(draw_convergence, converged, looks)))
     return found

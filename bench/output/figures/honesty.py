@@ -45,7 +45,7 @@ def draw_honesty(rows: Sequence[Record], looks: dict[str, Look]) -> Figure:
     lines = sum(len(of) + 1 for of in by_log.values())
     figure, panels = empty_figure(1, len(BLOCKS), WIDTH_IN, 0.9 + LINE_IN * lines)
     for block, axes in zip(BLOCKS, panels, strict=True):
-        band = band_of(list(rows), block)
+        band = band_of(rows, block)
         if band is not None:
             axes.axvspan(*band, color="black", alpha=0.12, linewidth=0)
         axes.axvline(1.0, color="black", linewidth=0.4)

@@ -15,8 +15,8 @@ from rich.text import Text
 
 from ...files import write_csv
 from ...metrics.scoring import by_reason
-from ...results.convergence import CONVERGENCE, convergence
-from ...results.honesty import HONESTY, honesty
+from ...results.convergence import CONVERGENCE
+from ...results.honesty import HONESTY
 from ...results.intervals import summarise_with_intervals
 from ...results.paired import PAIRED
 from ...results.summary import CONSISTENCY, Record, Rows, groups, is_judged, records, summarise
@@ -50,14 +50,14 @@ def write_paired(differences: Sequence[Record], path: Path) -> None:
     write_csv(pd.DataFrame(differences, columns=list(PAIRED)), path)
 
 
-def write_over_logs(rows: Rows, folder: Path) -> None:
-    """Write honesty.csv and convergence.csv."""
-    _write_over_logs(honesty(rows), HONESTY, folder / "honesty.csv")
-    _write_over_logs(convergence(rows), CONVERGENCE, folder / "convergence.csv")
+def write_over_logs(honest: Sequence[Record], converged: Sequence[Record], folder: Path) -> None:
+    """Write honesty.csv and convergence.csv: what `results.honesty` and `results.convergence` found."""
+    _write_over_logs(honest, HONESTY, folder / "honesty.csv")
+    _write_over_logs(converged, CONVERGENCE, folder / "convergence.csv")
 
 
 def _write_over_logs(found: Sequence[Record], columns: Sequence[str], path: Path) -> None:
-    """Write what `results.honesty` or `results.convergence` found as CSV; a log is a regime there."""
+    """Write records over logs as CSV; a log is a regime there."""
     table = pd.DataFrame(found, columns=list(columns)).astype(dict.fromkeys({*COUNTS} & {*columns}, "Int64"))
     write_csv(table.rename(columns={"log": "regime", "label": "estimator"}), path)
 
@@ -93,9 +93,9 @@ def print_differences(differences: Sequence[Record], console: Console) -> None:
         print_sheet(sheet, console, noted=sheet is found[-1])
 
 
-def print_over_logs(rows: Rows, console: Console) -> None:
+def print_over_logs(honest: Sequence[Record], converged: Sequence[Record], console: Console) -> None:
     """Print ANEES of all logs in one table, where there are several and seeds are enough, and who converged."""
-    for sheet in (over_logs.honesty(honesty(rows)), over_logs.convergence(convergence(rows))):
+    for sheet in (over_logs.honesty(honest), over_logs.convergence(converged)):
         if sheet is not None:
             print_sheet(sheet, console)
 

@@ -124,11 +124,11 @@ def test_runs_that_were_not_asked_have_no_convergence(rows: list[Record]) -> Non
 
 def test_table_and_file_hold_the_shares(rows: list[Record], tmp_path: Path) -> None:
     console = Console(file=StringIO(), width=80)
-    print_over_logs(rows, console)
+    print_over_logs([], convergence(rows), console)
     lines = console.file.getvalue().splitlines()  # pyright: ignore
     assert "  eskf" in next(line for line in lines if "2/4 [15 %, 85 %]" in line)
     assert any("  rts, all" in line and "0/4" in line and line.count("–") == 4 for line in lines)
-    write_over_logs(rows, tmp_path)
+    write_over_logs([], convergence(rows), tmp_path)
     table = pd.read_csv(tmp_path / "convergence.csv")
     assert table["converged"].tolist() == [4, 2, 0]
     assert table["regime"].tolist() == ["wrong by 0°", "wrong by 90°", "wrong by 90°"]

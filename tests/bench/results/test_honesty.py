@@ -13,8 +13,7 @@ import pytest
 from fathom.bench.drawing import looks_of
 from fathom.bench.metrics.state_error import BLOCKS, DOF
 from fathom.bench.output.figures.honesty import LEAST, MOST, draw_honesty
-from fathom.bench.output.over_logs import honesty as sheet_of
-from fathom.bench.output.tables.table import print_sheet, write_over_logs
+from fathom.bench.output.tables.table import print_over_logs, write_over_logs
 from fathom.bench.results.honesty import FALSE_ALARM, compared, honesty
 from fathom.bench.results.summary import Record
 from rich.console import Console
@@ -28,7 +27,7 @@ def row(log: str, label: str, seed: int, nees: dict[str, list[float]] | None, **
     """What `honesty` reads of a row of the store."""
     nees_at = json.dumps({"t_s": T_S} | nees) if nees else "{}"
     found = {"log": log, "label": label, "seed": seed, "output": "online", "status": "done", "lookahead_s": 0.0}
-    return found | {"spec": None, "nees_at": nees_at} | others
+    return found | {"nees_at": nees_at} | others
 
 
 def drawn(rng: np.random.Generator, factor: float = 1.0) -> dict[str, list[float]]:
@@ -42,17 +41,12 @@ def runs(log: str, label: str, factor: float = 1.0, seeds: int = SEEDS, **others
 
 
 @pytest.fixture(scope="module")
-def rows() -> list[Record]:
+def found() -> list[Record]:
     """Two logs; on the second one estimator overclaims, one is too modest, and one never finished."""
     rows = [*runs("easy", "eskf"), *runs("hard", "eskf", 3.0), *runs("hard", "shy", 0.4)]
     rows += [row("hard", "lost", seed, None, status="failed", lookahead_s=None) for seed in range(SEEDS)]
     smooth = {"output": "smoothed", "lookahead_s": math.inf}
-    return [*rows, *runs("hard", "rts", 3.0), *runs("hard", "rts", **smooth)]
-
-
-@pytest.fixture(scope="module")
-def found(rows: list[Record]) -> list[Record]:
-    return honesty(rows)
+    return honesty([*rows, *runs("hard", "rts", 3.0), *runs("hard", "rts", **smooth)])
 
 
 def of(found: list[Record], log: str, label: str, block: str = "all", output: str = "online") -> Record:
@@ -86,10 +80,10 @@ def test_one_consistent_estimator_in_a_hundred_leaves_its_band() -> None:
     assert left >= 1
 
 
-def test_who_did_not_finish_has_a_line_and_no_number(rows: list[Record], found: list[Record], tmp_path: Path) -> None:
+def test_who_did_not_finish_has_a_line_and_no_number(found: list[Record], tmp_path: Path) -> None:
     lost = of(found, "hard", "lost")
     assert (lost["anees"], lost["seeds"], lost["runs"]) == (None, 0, SEEDS)
-    write_over_logs(rows, tmp_path)
+    write_over_logs(found, [], tmp_path)
     table = pd.read_csv(tmp_path / "honesty.csv")
     assert list(table)[:5] == ["regime", "estimator", "output", "lookahead_s", "block"]
     assert len(table) == len(found)
@@ -112,9 +106,7 @@ def test_one_log_or_few_seeds_have_no_table_over_logs(found: list[Record]) -> No
 
 def printed(found: list[Record], width: int = 80) -> str:
     console = Console(file=StringIO(), width=width)
-    sheet = sheet_of(found)
-    if sheet is not None:
-        print_sheet(sheet, console)
+    print_over_logs(found, [], console)
     return console.file.getvalue()  # pyright: ignore
 
 
