@@ -90,14 +90,14 @@ def row(log: str, seed: int, at_s: float | None, ate_m: float = 1.0, nees: float
 
 @pytest.fixture(scope="module")
 def rows() -> list[Record]:
-    """Of four seeds two converge on the second log; one gets lost, and one fails before it begins."""
+    """Of four seeds two converge on the second log; one gets lost, and one fails. `rts` gets lost always."""
     rows = [row("wrong by 0°", seed, 0.0) for seed in range(4)]
     rows += [row("wrong by 90°", 0, 10.0, 3.0), row("wrong by 90°", 1, 20.0, 4.0, 9.0)]
     rows += [row("wrong by 90°", 2, None, 1e3, 1e5)]
     rows += [row("wrong by 90°", 3, None, status="failed", nees_at=None, ate_rmse_m=None, lookahead_s=None)]
     smooth = {"label": "rts", "output": "smoothed", "lookahead_s": math.inf}
     rows += [row("wrong by 90°", seed, 0.0, label="rts") for seed in range(4)]
-    return rows + [row("wrong by 90°", seed, None, **smooth) for seed in range(4)]
+    return rows + [row("wrong by 90°", seed, None, **smooth) for seed in range(3)]  # one ended before it smoothed
 
 
 def test_of_the_runs_that_converge_the_scores_are_pooled(rows: list[Record]) -> None:
@@ -108,6 +108,12 @@ def test_of_the_runs_that_converge_the_scores_are_pooled(rows: list[Record]) -> 
     assert some["anees_attitude"] == pytest.approx((3 + 9) / 2 / 3)
     assert some["anees_all"] == pytest.approx(1.0)
     assert [none[name] for name in ("label", "output", "converged", "median_s")] == ["rts", "smoothed", 0, None]
+    assert none["runs"] == 4
+
+
+def test_the_share_is_of_all_runs_those_without_this_output_too(rows: list[Record]) -> None:
+    found = [each | ({"converged_s": 0.0} if each["seed"] == 0 else {}) for each in rows]
+    assert convergence(found)[-1]["share"] == 1 / 4
 
 
 def test_the_interval_of_the_share_is_wilsons(rows: list[Record]) -> None:
