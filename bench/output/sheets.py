@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ...estimators.interface import OUTLIERS
-from ..metrics.bootstrap import FEWEST_SEEDS
 from ..metrics.floor_ratio import OVER
+from ..metrics.interval import FEWEST_SEEDS, HOLDS
 from ..metrics.scoring import INNOVATIONS, MEDIAN
 from ..metrics.state_error import BLOCKS
 from ..results.intervals import interval_over_seeds
+from ..results.paired import out_of_reach
 from ..results.summary import Record, groups
 from .cells import (
     ABSENT,
@@ -153,9 +154,7 @@ def accuracy(summary: Sequence[Record], done: Done | None = None) -> Sheet:
     if done is not None:
         enough = max(row["done"] for row in summary) >= FEWEST_SEEDS
         note.append(
-            "[ ]: 95 % bootstrap interval over seeds (with 20 seeds it holds in about 90 % of cases)"
-            if enough
-            else f"no intervals: they need {FEWEST_SEEDS} seeds"
+            f"[ ]: 95 % interval over seeds; it {HOLDS}" if enough else f"no intervals: they need {FEWEST_SEEDS} seeds"
         )
 
     def with_interval(score: str, row: Record) -> Cell:
@@ -184,7 +183,7 @@ def over_floor(summary: Sequence[Record]) -> Sheet | None:
         return None
     note = [
         "RMSE over the posterior Cramér–Rao bound at the same lag: 1 is the best possible",
-        f"[ ]: 95 % bootstrap interval over seeds, from {FEWEST_SEEDS} seeds on (with 20 it holds in 91 % of cases)",
+        f"[ ]: 95 % interval over seeds, from {FEWEST_SEEDS} seeds on; it {HOLDS}",
     ]
 
     def ratio(row: Record, block: str) -> Cell:
@@ -323,7 +322,9 @@ def _difference(row: Record) -> Line:
             Cell(signed(row["difference"]), row["difference"]),
             _or_absent(interval(row["low"], row["high"], signed), row["low"], f"intervals need {FEWEST_SEEDS} seeds"),
             _or_absent(percent(row["ratio"]), row["ratio"], "a ratio needs numbers above zero"),
-            _or_absent("" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p, NO_TEST),
+            _or_absent(
+                "" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p, NO_TEST if r is None else ONE_RUN
+            ),
             _or_absent("" if r is None else f"{r:+.2f}", r, NO_TEST),
         ]
         output = output_and_lag(row["output"], seen)
@@ -333,6 +334,7 @@ def _difference(row: Record) -> Line:
     return Line(variant(row), [*cells, seeds], output, both, seen, column(row["score"]).raw)
 
 
+ONE_RUN = "no test: both are one configuration under two names"
 NO_TEST = f"no test: it needs {FEWEST_SEEDS} seeds of a simulated log that both finished"
 
 
@@ -343,20 +345,12 @@ def _or_absent(shown: str, value: float | None, why: str) -> Cell:
 
 def _paired_note(paired: Sequence[Record]) -> list[str]:
     tests = [row for row in paired if row["p_holm"] is not None]
-    lines = [
-        "Δ: variant minus baseline, over the seeds that both finished; 95 %: bootstrap interval over seeds (with 20 "
-        "seeds it holds in 90 % of cases)"
-    ]
+    lines = [f"Δ: variant minus baseline, over the seeds that both finished; 95 %: interval over seeds, which {HOLDS}"]
     if not tests:
         return [*lines, f"neither intervals nor tests: they need {FEWEST_SEEDS} seeds of a simulated log"]
     lines.append(
         f"p: Wilcoxon's signed-rank test over seeds, corrected by Holm for {len(tests)} tests; "
         "r: its rank-biserial correlation, ±1 where all seeds agree"
     )
-    least = min(len(tests) * 2.0 ** (1 - row["pairs"]) for row in tests)
-    if least > 0.05:
-        lines.append(
-            f"with so many tests on so few seeds there is no p under {min(1.0, least):.2g}: run more seeds, or compare "
-            "less"
-        )
-    return lines
+    too_few = out_of_reach(max(row["pairs"] for row in tests), len(tests))
+    return [*lines, too_few] if too_few else lines
