@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from ...estimators.interface import OUTLIERS
 from ..metrics.floor_ratio import OVER
 from ..metrics.interval import FEWEST_SEEDS, HOLDS
-from ..metrics.scoring import INNOVATIONS, MEDIAN
+from ..metrics.scoring import ELLIPSOIDS, LOG_DENSITY, MEDIAN, NIS, WHITENESS
 from ..metrics.state_error import BLOCKS
 from ..results.intervals import interval_over_seeds
 from ..results.paired import out_of_reach
@@ -198,7 +198,7 @@ def over_floor(summary: Sequence[Record]) -> Sheet | None:
 
 def consistency(summary: Sequence[Record]) -> Sheet | None:
     """Return ANEES, NIS and coverage; None where there are none."""
-    sensors = [name for name in INNOVATIONS if any(row[name] is not None for row in summary)]
+    sensors = [name for name in NIS if any(row[name] is not None for row in summary)]
     times = max((row["anees_times"] or 0 for row in summary), default=0)
     if not sensors and not times:
         return None
@@ -245,6 +245,42 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
     return Sheet(f"{summary[0]['log']}: consistency", note, headings, lines)
 
 
+def prediction(summary: Sequence[Record]) -> Sheet | None:
+    """Return scores of the whole stated law, not of its size alone; None where there are none."""
+    columns = [name for name in (*LOG_DENSITY, *WHITENESS) if any(row[name] is not None for row in summary)]
+    if not columns and all(row["energy_score_m"] is None for row in summary):
+        return None
+    note = [
+        "energy score: of position, error and covariance in one; lower is better",
+        f"inside: position errors in the ellipsoids of {', '.join(map(str, ELLIPSOIDS))} %, as many if consistent",
+    ]
+    if columns:
+        note += [
+            "log p: density of the readings as predicted, nats per degree of freedom; higher is better",
+            "white: correlation of innovations with the ones before; 0 if consistent, ▲ outside its interval (99.9 %)",
+        ]
+
+    def inside(row: Record) -> Cell:
+        shares = [row[f"inside_{percent}_position"] for percent in ELLIPSOIDS]
+        if None in shares:
+            return absent("inside_50_position", row)
+        return Cell(" ".join(f"{100 * share:.0f}" for share in shares), shares[0])
+
+    def of_sensor(name: str, row: Record) -> Cell:
+        return cell(name, row)._replace(mark="▲" if row.get(f"{name}_outside") else "")
+
+    named = {"log_density": "log p", "whiteness": "white"}
+    headings = ["estimator", "runs", column("energy_score_m").heading, f"inside\n{', '.join(map(str, ELLIPSOIDS))} %"]
+    for name in columns:
+        score, _, sensor = name.rpartition("_")
+        headings.append(f"{named[score]}\n{SHORT.get(sensor, sensor)}")
+    lines = [
+        _line(row, [_runs(row), cell("energy_score_m", row), inside(row), *(of_sensor(name, row) for name in columns)])
+        for row in _by_label(summary)
+    ]
+    return Sheet(f"{summary[0]['log']}: what was predicted", note, headings, lines)
+
+
 def late_or_out(summary: Sequence[Record]) -> Sheet | None:
     """Return what became of late readings and outliers; None where there were none."""
     outliers = [name for name in summary[0] if name.startswith(OUTLIERS)]
@@ -276,7 +312,7 @@ def cost(summary: Sequence[Record]) -> Sheet | None:
         Line(label, [cell(name, row) for name in MEDIAN]) for (label,), (row, *_) in groups(summary, "label").items()
     ]
     note = ["medians over runs; × real time: length of the log over the time of all steps and of the finish"]
-    if any(row[name] is not None for row in summary for name in INNOVATIONS):
+    if any(row[name] is not None for row in summary for name in NIS):
         note.append(NOT_COMPARABLE)
     headings = ["estimator", *(column(name).heading for name in MEDIAN)]
     return Sheet(f"{summary[0]['log']}: cost", note, headings, lines)

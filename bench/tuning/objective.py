@@ -17,18 +17,19 @@ from ..errors import ExperimentError
 from ..metrics.comparison import OVER_SEEDS
 from ..metrics.floor_ratio import FLOORS
 from ..metrics.interval import interval
-from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
+from ..metrics.scoring import ELLIPSOIDS, MEDIAN, NIS, OF_ELLIPSOIDS, POOLED
 from ..results.paired import TAKE
 
 EXPECTED: dict[str, float] = (
-    dict.fromkeys(INNOVATIONS, 1.0)
+    dict.fromkeys(NIS, 1.0)
     | {f"nees_{block}": 3.0 for block in ("position", "attitude", "velocity")}
     | {"nees_biases": 6.0, "nees_all": 15.0}
-    | {f"within_{k}sigma_{of}": float(chi2.cdf(k**2, 1)) for k in (1, 2, 3) for of in ("position", "all")}
+    | {f"within_{k}sigma_{of}": float(chi2.cdf(k**2, 1)) for k in (1, 2, 3) for of in OF_ELLIPSOIDS}
+    | {f"inside_{percent}_{of}": percent / 100 for percent in ELLIPSOIDS for of in OF_ELLIPSOIDS}
 )
 """Expected values of consistency scores, for a consistent estimator."""
 
-SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(INNOVATIONS)
+SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(NIS)
 """Scores that a search can minimise. Costs do not depend on the noise, and the floor not on the estimator."""
 
 
@@ -63,7 +64,7 @@ class Objective:
     @property
     def needs_nis(self) -> bool:
         """Whether the score needs NIS."""
-        return self.score in INNOVATIONS
+        return self.score in NIS
 
     @property
     def is_distance(self) -> bool:
