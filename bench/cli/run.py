@@ -58,8 +58,12 @@ def run(
     from ..execution.sweep import sweep
     from ..experiment.plan import Experiment
     from ..output.present import present, print_log
+    from ..results.paired import out_of_reach
+    from ..saying import say
 
     plan = Experiment.load(experiment)
+    if too_few := out_of_reach(len(plan.seeds), plan.least_tests()):
+        say(f"{plan.name}: {too_few}")
     folder = out / plan.name
     printed: set[str] = set()
 

@@ -12,6 +12,7 @@ from ...datasets.epochs import SENSOR
 from ...datasets.state import TimeArray
 from ...datasets.trajectory import Trajectory
 from ...estimators.physics.innovation import INNOVATION
+from ..metrics.consistency import autocorrelation
 from ..metrics.scoring import INNOVATIONS
 from ..results.step_time import step_histogram
 
@@ -69,7 +70,10 @@ def innovation_scores(result: Result) -> dict[str, float | None]:
     """Return every score of INNOVATIONS by name; None where it was not asked for, or no such reading came in time."""
     row: dict[str, float | None] = dict.fromkeys(INNOVATIONS)
     for sensor, dof in innovation_dof(result).items():
-        row[f"nis_{sensor}"] = float(_of_sensor(result, sensor)["nis"].sum()) / dof
+        of_sensor = _of_sensor(result, sensor)
+        row[f"nis_{sensor}"] = float(of_sensor["nis"].sum()) / dof
+        row[f"log_density_{sensor}"] = float(of_sensor["log_density"].sum()) / dof
+        row[f"whiteness_{sensor}"] = autocorrelation(of_sensor["white"][np.argsort(of_sensor["t_ns"], kind="stable")])
     return row
 
 

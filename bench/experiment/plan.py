@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 
 from ...datasets.errors import DatasetError, complaints, nearest
 from ...datasets.formats.yaml_file import read_yaml
+from ...datasets.simulated.scenario import Scenario
 from ..errors import ExperimentError
 from ..metrics.comparison import Comparison
 from ..metrics.scoring import Scoring
@@ -124,6 +125,25 @@ class Experiment(Settings):
             for of_log, of_label in ((log.name, each.baseline or self.baseline), (log.baseline, each.label))
             if (of_log, of_label) != (log.name, each.label) and {(log.name, each.label), (of_log, of_label)} <= ran
         ]
+
+    def least_tests(self) -> int:
+        """Return how many paired tests there are at least: those of the online outputs on simulated logs.
+
+        A comparison of two runs of one configuration is none: of two labels of it, or without a sensor that the log has
+        not anyway.
+        """
+        logs, estimators = {log.name: log for log in self.logs}, {each.label: each for each in self.estimators}
+
+        def what_runs(log: str, label: str) -> tuple[Any, ...]:
+            scenario, estimator = Scenario.from_dict(logs[log].scenario or {}), estimators[label]
+            used = [sensor for sensor in estimator.create().factors if getattr(scenario, sensor, None) is not None]
+            return scenario, estimator.name, {**estimator.config, "factors": sorted(used)}
+
+        return len(self.compare) * sum(
+            what_runs(log, label) != what_runs(of_log, of_label)
+            for log, label, of_log, of_label in self.comparisons()
+            if logs[log].scenario is not None and logs[of_log].scenario is not None
+        )
 
     def scoring(self, log: LogSpec) -> Scoring:
         """Return how runs on this log are scored."""

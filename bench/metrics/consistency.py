@@ -1,4 +1,4 @@
-"""Consistency over seeds: ANEES at times fixed beforehand, and NIS, with their chi-square intervals.
+"""Consistency over seeds: ANEES at times fixed beforehand, and NIS, with their chi-square intervals; whiteness.
 
 Errors of one run are correlated in time, so their average over time is not chi-square, and an interval for it would
 raise false alarms. Over seeds they are independent: at one time, the NEES of N seeds of a block with d degrees of
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainccinv, gammaincinv
+from scipy.special import gammainccinv, gammaincinv, ndtri
 
 from ...datasets.log import Log
 from ...datasets.state import Array
@@ -156,16 +156,44 @@ def anees_of(runs: Sequence[str | None]) -> dict[Block, Average]:
 
 def pooled_nis(runs: Sequence[Mapping[str, Any]]) -> dict[str, Average]:
     """Pool the NIS of each sensor over time and runs (rows of the store); sensors without NIS are left out."""
-    total: dict[str, list[tuple[float, int]]] = {}
+    return {
+        sensor: _average(np.array([np.nan]), *(np.array([x]) for x in (runs_of, dof, value * dof)))
+        for sensor, (value, dof, runs_of) in pooled(runs, "nis").items()
+    }
+
+
+def pooled_whiteness(runs: Sequence[Mapping[str, Any]]) -> dict[str, Average]:
+    """Pool the `autocorrelation` of each sensor's innovations likewise, with the interval of white ones."""
+    found = {}
+    for sensor, (value, dof, runs_of) in pooled(runs, "whiteness").items():
+        half = float(-ndtri(0.5 * FALSE_ALARM)) / np.sqrt(dof)
+        found[sensor] = Average(*(np.array([x]) for x in (np.nan, runs_of, dof, value, -half, half)))
+    return found
+
+
+def pooled(runs: Sequence[Mapping[str, Any]], score: str) -> dict[str, tuple[float, int, int]]:
+    """Return the mean of a score of innovations over runs, by degrees of freedom; with these, and how many runs."""
+    each: dict[str, list[tuple[float, int]]] = {}
     for run in runs:
         for sensor, dof in json.loads(run["nis_dof"] or "{}").items():
-            if (nis := run.get(f"nis_{sensor}")) is not None:
-                total.setdefault(sensor, []).append((nis * dof, dof))
+            if (value := run.get(f"{score}_{sensor}")) is not None:
+                each.setdefault(sensor, []).append((value, dof))
     found = {}
-    for sensor, each in total.items():
-        sums, dofs = (np.array(column) for column in zip(*each, strict=True))
-        found[sensor] = _average(np.array([np.nan]), np.array([len(each)]), dofs.sum()[None], sums.sum()[None])
+    for sensor, of_sensor in each.items():
+        dof = sum(n for _, n in of_sensor)
+        found[sensor] = (sum(value * n for value, n in of_sensor) / dof, dof, len(of_sensor))
     return found
+
+
+def autocorrelation(white: Array) -> float | None:
+    """Return the correlation of each of n vectors with the one before it, (n, d); None for fewer than two.
+
+    Of innovations with their covariance divided out. Those of a consistent filter are white: 0, with a σ of one over
+    the root of all their degrees of freedom. The mean is not subtracted, so a bias shows as well. Components that were
+    not measured are 0. See docs/conventions.md (68).
+    """
+    square = float((white * white).sum())
+    return float((white[1:] * white[:-1]).sum()) / square if len(white) > 1 and square > 0.0 else None
 
 
 def _average(t_s: Array, runs: NDArray[np.int64], dof: NDArray[np.int64], total: Array) -> Average:

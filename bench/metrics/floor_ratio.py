@@ -1,4 +1,4 @@
-"""An estimator's RMSE over the floor, with a bootstrap interval over seeds; docs/conventions.md (61)."""
+"""An estimator's RMSE over the floor, with its interval over seeds; docs/conventions.md (61)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from ...datasets.state import POSITION, THETA, VELOCITY, Array, TimeArray
 from ...datasets.trajectory import Trajectory
 from .association import ScoreError, associate
-from .bootstrap import bootstrap_interval
 from .floor import Floor
+from .interval import interval
 from .pose_error import check_finite
 from .state_error import error_state
 
@@ -36,7 +36,7 @@ class FloorRatio:
 
     Attributes:
         ratio: root of the mean squared error over root of the mean bound.
-        low, high: bootstrap interval; None with fewer than FEWEST_SEEDS.
+        low, high: its `interval`; None with fewer than FEWEST_SEEDS.
         level: of the interval.
         seeds: number of runs.
     """
@@ -86,29 +86,21 @@ def floor_scores(floor: Floor, t_ns: TimeArray) -> dict[str, float | None]:
     return dict(zip(FLOORS, (p, math.degrees(theta), v), strict=True))
 
 
-def rmse_over_floor(
-    squared_error: Array, floor_variance: Array, level: float = 0.95, resamples: int = 9999, seed: int = 0
-) -> FloorRatio:
+def rmse_over_floor(squared_error: Array, floor_variance: Array, level: float = 0.95) -> FloorRatio:
     """Return the ratio of root means over seeds, √(mean squared error / mean bound), and its interval.
 
-    The interval is a bootstrap over seeds that keeps error and bound of a seed together. It is bias-corrected and
-    accelerated (BCa), because the ratio is skewed and seeds are few.
-
     Args:
-        squared_error, floor_variance: (n,), one per seed, from `squares`.
+        squared_error, floor_variance: (n,), one per seed, from `squares`; they stay together.
         level: of the interval, between 0 and 1.
-        resamples, seed: of the bootstrap.
 
     Raises:
         ScoreError: no seeds, a value that is not finite, or a floor that is not positive.
-
-    Source: Efron 1987, doi:10.1080/01621459.1987.10478410.
     """
     e, f = np.asarray(squared_error, np.float64), np.asarray(floor_variance, np.float64)
     if len(e) == 0 or e.shape != f.shape or not (np.isfinite(e).all() and np.isfinite(f).all() and f.min() > 0):
         raise ScoreError("floor: a ratio needs at least one seed, with a finite error and a positive bound for each")
     ratio = float(_ratio(e, f))
-    low, high = bootstrap_interval((e, f), _ratio, "BCa", level, resamples, seed) or (None, None)
+    low, high = interval((e, f), _ratio, positive=True, level=level) or (None, None)
     return FloorRatio(ratio, low, high, level, len(e))
 
 

@@ -20,10 +20,18 @@ from .absolute_error import ate, drift, horizontal_error, outage_drift
 from .alignment import Alignment, align
 from .association import ScoreError, associate
 from .convergence import converged_s
+from .energy_score import energy_score
 from .floor_ratio import FLOORS
 from .pose_error import Dims
 from .relative_error import Pairs, Unit, check_step, rpe, segment_errors
-from .state_error import BLOCKS, Block, coverage, nees, not_positive, state_errors
+from .state_error import BLOCKS, DOF, Block, coverage, judged, nees, not_positive, share_inside, state_errors
+
+ELLIPSOIDS = (50, 90, 99)
+"""Per cent of a consistent estimate's errors inside: the middle, and two tails."""
+OF_ELLIPSOIDS = {"position": "position", "all": "the whole state"}
+"""The blocks whose ellipsoids are scored, and their names in words."""
+HONESTY = ("nees_", "within_", "inside_", "energy_")
+"""Prefixes of the scores of an estimate's covariance."""
 
 SCORES = {
     "n_scored": "poses compared",
@@ -58,14 +66,25 @@ SCORES = {
     "within_2sigma_all": "the same within 2 σ; 0.954 if consistent",
     "within_3sigma_all": "the same within 3 σ; 0.997 if consistent",
     "converged_s": "when the attitude's error falls below `converged_deg` for good, s; where that is stated",
+    **{
+        f"inside_{percent}_{block}": f"share of errors of {what} inside the {percent} % ellipsoid of their covariance"
+        for block, what in OF_ELLIPSOIDS.items()
+        for percent in ELLIPSOIDS
+    },
+    "energy_score_m": "mean energy score of position, m: error and covariance in one, lower is better",
     "n_not_positive": "poses whose covariance is not positive definite; these have no NEES",
 }
 
 
-INNOVATIONS = {
-    f"nis_{sensor}": f"NIS of the {sensor} readings that came in time, mean per degree of freedom; 1 if consistent"
-    for sensor in dict.fromkeys(SENSOR)
-}
+NIS, LOG_DENSITY, WHITENESS = (
+    {f"{score}_{sensor}": what.format(sensor) for sensor in dict.fromkeys(SENSOR)}
+    for score, what in {
+        "nis": "NIS of the {} readings, mean per degree of freedom; 1 if consistent",
+        "log_density": "log-likelihood of the {} readings as predicted, nats per degree of freedom: higher is better",
+        "whiteness": "correlation of an innovation of {} with the one before it; 0 if consistent",
+    }.items()
+)
+INNOVATIONS = NIS | LOG_DENSITY | WHITENESS
 """Only where `nis` is asked for, and of the online output."""
 
 
@@ -204,13 +223,15 @@ def can_judge(log: Log, scoring: Scoring) -> bool:
 
 def _consistency(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Scoring) -> Found:
     """Return NEES and coverage; absent for a block without truth, or without a valid covariance."""
-    names = [name for name in SCORES if name.startswith(("nees_", "within_", "n_not_positive"))]
+    names = [name for name in SCORES if name.startswith((*HONESTY, "n_not_positive"))]
     if not can_judge(log, scoring):
         return dict.fromkeys(names, "covariances are judged only against ground truth, unaligned")
     found: Found = {}
     for block in BLOCKS:
-        found |= _or_why([f"nees_{block}"], _nees, truth, estimate, block)
-    for block in ("position", "all"):
+        inside = [f"inside_{percent}_{block}" for percent in ELLIPSOIDS if block in OF_ELLIPSOIDS]
+        found |= _or_why([f"nees_{block}", *inside], _nees, truth, estimate, block)
+    found |= _or_why(["energy_score_m"], _energy, truth, estimate)
+    for block in OF_ELLIPSOIDS:
         found |= _or_why([f"within_{k}sigma_{block}" for k in (1, 2, 3)], _coverage, truth, estimate, block)
     sound = not isinstance(found["nees_all"], str)
     return found | ({"n_not_positive": 0} if sound else _or_why(["n_not_positive"], _not_positive, estimate))
@@ -219,7 +240,17 @@ def _consistency(log: Log, truth: Trajectory, estimate: Trajectory, scoring: Sco
 def _nees(truth: Trajectory, estimate: Trajectory, block: Block) -> Found:
     each = nees(truth, estimate, block)
     known = not np.isnan(each).all()
-    return {f"nees_{block}": float(np.nanmean(each)) if known else NO_COVARIANCE}
+    found: Found = {f"nees_{block}": float(np.nanmean(each)) if known else NO_COVARIANCE}
+    for percent in ELLIPSOIDS if block in OF_ELLIPSOIDS else ():
+        share = share_inside(each, DOF[block], percent / 100) if known else NO_COVARIANCE
+        found[f"inside_{percent}_{block}"] = share
+    return found
+
+
+def _energy(truth: Trajectory, estimate: Trajectory) -> Found:
+    e, P, _ = judged(truth, estimate, "position")
+    known = np.isfinite(e).all(axis=1) & np.isfinite(P).all(axis=(1, 2))
+    return {"energy_score_m": float(energy_score(e[known], P[known]).mean()) if known.any() else NO_COVARIANCE}
 
 
 def _coverage(truth: Trajectory, estimate: Trajectory, block: Block) -> Found:
@@ -346,7 +377,7 @@ MEAN = (
     "outage_percent",
     "segment_percent",
     "cep50_m",
-    *(name for name in SCORES if name.startswith(("nees_", "within_"))),
+    *(name for name in SCORES if name.startswith(HONESTY)),
 )
 """Scores of which the mean over seeds is taken."""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.special import gammainc
 
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState, TimeArray
 from ...datasets.trajectory import Trajectory
@@ -80,7 +81,7 @@ def nees(truth: Trajectory, estimate: Trajectory, block: Block = "position", tol
 
     Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2; e in the coordinates of `fathom.datasets.state`.
     """
-    e, P, t_ns = _judged(truth, estimate, block, tolerance_ns)
+    e, P, t_ns = judged(truth, estimate, block, tolerance_ns)
     known = ~(np.isnan(e).any(axis=1) | np.isnan(P).any(axis=(1, 2)))
     score = np.full(len(e), np.nan)
     try:
@@ -114,7 +115,7 @@ def coverage(
     Raises:
         ScoreError: as `nees`, except for a P that is not positive definite; also if P is NaN in every row.
     """
-    e, P, _ = _judged(truth, estimate, block, tolerance_ns)
+    e, P, _ = judged(truth, estimate, block, tolerance_ns)
     variance = np.einsum("nii->ni", P)
     known = ~(np.isnan(e) | np.isnan(variance))
     if not known.any():
@@ -122,6 +123,15 @@ def coverage(
     squared, bound = e[known] ** 2, variance[known]
     one, two, three = (float((squared <= k**2 * bound).mean()) for k in (1, 2, 3))
     return one, two, three
+
+
+def share_inside(nees: Array, dof: int, probability: float) -> float:
+    """Return the share of errors inside the ellipsoid of this probability, by their NEES (n,).
+
+    Of a consistent Gaussian estimate it is the probability, on average; docs/conventions.md (64). NaNs are left out.
+    """
+    known = nees[~np.isnan(nees)]
+    return float((gammainc(0.5 * dof, 0.5 * known) <= probability).mean())
 
 
 def not_positive(estimate: Trajectory) -> TimeArray:
@@ -148,8 +158,10 @@ def _has_root(P: Array) -> bool:
     return True
 
 
-def _judged(truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns: int) -> tuple[Array, Array, TimeArray]:
-    """Return the block's errors (n, k), covariances (n, k, k) and times (n,), of the associated rows.
+def judged(
+    truth: Trajectory, estimate: Trajectory, block: Block, tolerance_ns: int = 0
+) -> tuple[Array, Array, TimeArray]:
+    """Return the block's errors (n, k) of (54), covariances (n, k, k) and times (n,), of the associated rows.
 
     Raises:
         ScoreError: unknown block, the estimate has no P, or part of the block is unknown in every row.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from ..metrics.floor_ratio import OVER
+from ..metrics.scoring import INNOVATIONS
 from ..results.summary import Record, why_missing
 
 ABSENT = "–"
@@ -145,6 +146,7 @@ OTHERS = (
     Column("velocity_rmse_m_s", "velocity", "m/s"),
     Column("drift_max_percent", "largest drift", "%"),
     Column("outage_percent", "outage drift", "%"),
+    Column("energy_score_m", "energy score", "m"),
     Column("us_per_imu_sample", "per IMU sample", "µs"),
     Column("peak_mb", "peak memory", "MB"),
 )
@@ -201,7 +203,7 @@ def _reason(score: str, row: Record) -> str:
     missing = row["missing"] if isinstance(row["missing"], dict) else why_missing(row)
     if score in missing:
         return missing[score]
-    if score.startswith("nis_"):
+    if score in INNOVATIONS:
         return "no innovations (smoothed, or no reading in time)"
     if score.startswith("over_floor_"):
         return missing.get(OVER[score.removeprefix("over_floor_")][1], "no floor of this output")

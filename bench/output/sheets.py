@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ...estimators.interface import OUTLIERS
-from ..metrics.bootstrap import FEWEST_SEEDS
 from ..metrics.floor_ratio import OVER
-from ..metrics.scoring import INNOVATIONS, MEDIAN
+from ..metrics.interval import FEWEST_SEEDS, HOLDS
+from ..metrics.scoring import ELLIPSOIDS, LOG_DENSITY, MEDIAN, NIS, WHITENESS
 from ..metrics.state_error import BLOCKS
 from ..results.intervals import interval_over_seeds
+from ..results.paired import out_of_reach
 from ..results.summary import Record, groups
 from .cells import (
     ABSENT,
@@ -153,9 +154,7 @@ def accuracy(summary: Sequence[Record], done: Done | None = None) -> Sheet:
     if done is not None:
         enough = max(row["done"] for row in summary) >= FEWEST_SEEDS
         note.append(
-            "[ ]: 95 % bootstrap interval over seeds (with 20 seeds it holds in about 90 % of cases)"
-            if enough
-            else f"no intervals: they need {FEWEST_SEEDS} seeds"
+            f"[ ]: 95 % interval over seeds; it {HOLDS}" if enough else f"no intervals: they need {FEWEST_SEEDS} seeds"
         )
 
     def with_interval(score: str, row: Record) -> Cell:
@@ -184,7 +183,7 @@ def over_floor(summary: Sequence[Record]) -> Sheet | None:
         return None
     note = [
         "RMSE over the posterior Cramér–Rao bound at the same lag: 1 is the best possible",
-        f"[ ]: 95 % bootstrap interval over seeds, from {FEWEST_SEEDS} seeds on (with 20 it holds in 91 % of cases)",
+        f"[ ]: 95 % interval over seeds, from {FEWEST_SEEDS} seeds on; it {HOLDS}",
     ]
 
     def ratio(row: Record, block: str) -> Cell:
@@ -199,7 +198,7 @@ def over_floor(summary: Sequence[Record]) -> Sheet | None:
 
 def consistency(summary: Sequence[Record]) -> Sheet | None:
     """Return ANEES, NIS and coverage; None where there are none."""
-    sensors = [name for name in INNOVATIONS if any(row[name] is not None for row in summary)]
+    sensors = [name for name in NIS if any(row[name] is not None for row in summary)]
     times = max((row["anees_times"] or 0 for row in summary), default=0)
     if not sensors and not times:
         return None
@@ -246,6 +245,42 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
     return Sheet(f"{summary[0]['log']}: consistency", note, headings, lines)
 
 
+def prediction(summary: Sequence[Record]) -> Sheet | None:
+    """Return scores of the whole stated law, not of its size alone; None where there are none."""
+    columns = [name for name in (*LOG_DENSITY, *WHITENESS) if any(row[name] is not None for row in summary)]
+    if not columns and all(row["energy_score_m"] is None for row in summary):
+        return None
+    note = [
+        "energy score: of position, error and covariance in one; lower is better",
+        f"inside: position errors in the ellipsoids of {', '.join(map(str, ELLIPSOIDS))} %, as many if consistent",
+    ]
+    if columns:
+        note += [
+            "log p: density of the readings as predicted, nats per degree of freedom; higher is better",
+            "white: correlation of innovations with the ones before; 0 if consistent, ▲ outside its interval (99.9 %)",
+        ]
+
+    def inside(row: Record) -> Cell:
+        shares = [row[f"inside_{percent}_position"] for percent in ELLIPSOIDS]
+        if None in shares:
+            return absent("inside_50_position", row)
+        return Cell(" ".join(f"{100 * share:.0f}" for share in shares), shares[0])
+
+    def of_sensor(name: str, row: Record) -> Cell:
+        return cell(name, row)._replace(mark="▲" if row.get(f"{name}_outside") else "")
+
+    named = {"log_density": "log p", "whiteness": "white"}
+    headings = ["estimator", "runs", column("energy_score_m").heading, f"inside\n{', '.join(map(str, ELLIPSOIDS))} %"]
+    for name in columns:
+        score, _, sensor = name.rpartition("_")
+        headings.append(f"{named[score]}\n{SHORT.get(sensor, sensor)}")
+    lines = [
+        _line(row, [_runs(row), cell("energy_score_m", row), inside(row), *(of_sensor(name, row) for name in columns)])
+        for row in _by_label(summary)
+    ]
+    return Sheet(f"{summary[0]['log']}: what was predicted", note, headings, lines)
+
+
 def late_or_out(summary: Sequence[Record]) -> Sheet | None:
     """Return what became of late readings and outliers; None where there were none."""
     outliers = [name for name in summary[0] if name.startswith(OUTLIERS)]
@@ -277,7 +312,7 @@ def cost(summary: Sequence[Record]) -> Sheet | None:
         Line(label, [cell(name, row) for name in MEDIAN]) for (label,), (row, *_) in groups(summary, "label").items()
     ]
     note = ["medians over runs; × real time: length of the log over the time of all steps and of the finish"]
-    if any(row[name] is not None for row in summary for name in INNOVATIONS):
+    if any(row[name] is not None for row in summary for name in NIS):
         note.append(NOT_COMPARABLE)
     headings = ["estimator", *(column(name).heading for name in MEDIAN)]
     return Sheet(f"{summary[0]['log']}: cost", note, headings, lines)
@@ -323,7 +358,9 @@ def _difference(row: Record) -> Line:
             Cell(signed(row["difference"]), row["difference"]),
             _or_absent(interval(row["low"], row["high"], signed), row["low"], f"intervals need {FEWEST_SEEDS} seeds"),
             _or_absent(percent(row["ratio"]), row["ratio"], "a ratio needs numbers above zero"),
-            _or_absent("" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p, NO_TEST),
+            _or_absent(
+                "" if p is None else "< 0.0001" if p < 1e-4 else f"{p:.4f}", p, NO_TEST if r is None else ONE_RUN
+            ),
             _or_absent("" if r is None else f"{r:+.2f}", r, NO_TEST),
         ]
         output = output_and_lag(row["output"], seen)
@@ -333,6 +370,7 @@ def _difference(row: Record) -> Line:
     return Line(variant(row), [*cells, seeds], output, both, seen, column(row["score"]).raw)
 
 
+ONE_RUN = "no test: both are one configuration under two names"
 NO_TEST = f"no test: it needs {FEWEST_SEEDS} seeds of a simulated log that both finished"
 
 
@@ -343,20 +381,12 @@ def _or_absent(shown: str, value: float | None, why: str) -> Cell:
 
 def _paired_note(paired: Sequence[Record]) -> list[str]:
     tests = [row for row in paired if row["p_holm"] is not None]
-    lines = [
-        "Δ: variant minus baseline, over the seeds that both finished; 95 %: bootstrap interval over seeds (with 20 "
-        "seeds it holds in 90 % of cases)"
-    ]
+    lines = [f"Δ: variant minus baseline, over the seeds that both finished; 95 %: interval over seeds, which {HOLDS}"]
     if not tests:
         return [*lines, f"neither intervals nor tests: they need {FEWEST_SEEDS} seeds of a simulated log"]
     lines.append(
         f"p: Wilcoxon's signed-rank test over seeds, corrected by Holm for {len(tests)} tests; "
         "r: its rank-biserial correlation, ±1 where all seeds agree"
     )
-    least = min(len(tests) * 2.0 ** (1 - row["pairs"]) for row in tests)
-    if least > 0.05:
-        lines.append(
-            f"with so many tests on so few seeds there is no p under {min(1.0, least):.2g}: run more seeds, or compare "
-            "less"
-        )
-    return lines
+    too_few = out_of_reach(max(row["pairs"] for row in tests), len(tests))
+    return [*lines, too_few] if too_few else lines

@@ -1,4 +1,4 @@
-"""Bootstrap intervals of scores over seeds: the seeds are resampled."""
+"""Intervals of scores over seeds."""
 
 from __future__ import annotations
 
@@ -7,23 +7,18 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..metrics.bootstrap import bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS
+from ..metrics.interval import interval
 from ..metrics.scoring import POOLED
 from .paired import TAKE
 from .summary import Record, Rows, groups, has_score, records, summarise
 
-RESAMPLES = 1999
-"""A thousand or more are customary for such intervals; of 1999, sorted, the 50th is the end at 2.5 %."""
 TABLED = ("ate_rmse_m", "heading_rmse_deg", "drift_end_percent", "rpe_rmse_m")
 """Scores whose intervals stand in table.csv and table.tex."""
 
 
 def interval_over_seeds(done: Sequence[Record], score: str) -> tuple[float, float] | None:
-    """Return the 95 % bootstrap interval of what `summarise` makes of a score; None with fewer than FEWEST_SEEDS seeds.
-
-    Bias-corrected and accelerated, or of percentiles for a median, as in `paired.difference`, which also says how much
-    too narrow it is with few seeds.
+    """Return the 95 % `interval` of what `summarise` makes of a score; None with fewer than FEWEST_SEEDS seeds.
 
     Args:
         done: the rows of one log, estimator and output that finished.
@@ -39,11 +34,11 @@ def interval_over_seeds(done: Sequence[Record], score: str) -> tuple[float, floa
 @lru_cache(maxsize=10_000)
 def _interval(values: tuple[float, ...], weights: tuple[float, ...], score: str) -> tuple[float, float] | None:
     over = OVER_SEEDS[score]
-    return bootstrap_interval(
+    return interval(
         (np.array(values), np.array(weights)),
         lambda value, weight, axis=-1: TAKE[over](value, weight, axis),
-        method="percentile" if over == "median" else "BCa",
-        resamples=RESAMPLES,
+        positive=True,
+        median=over == "median",
     )
 
 

@@ -15,10 +15,10 @@ import pandas as pd
 
 from ...datasets.epochs import IMU_GAP
 from ...estimators.interface import OUTLIERS
-from ..metrics.consistency import anees_of, pooled_nis
+from ..metrics.consistency import anees_of, pooled, pooled_nis, pooled_whiteness
 from ..metrics.floor_ratio import OVER, rmse_over_floor
 from ..metrics.pose_error import pooled_rmse
-from ..metrics.scoring import INNOVATIONS, MEAN, MEDIAN, POOLED
+from ..metrics.scoring import INNOVATIONS, MEAN, MEDIAN, NIS, POOLED, WHITENESS
 from ..metrics.state_error import BLOCKS
 
 Record: TypeAlias = dict[str, Any]
@@ -190,9 +190,12 @@ def _over_floor(done: Sequence[Record]) -> Record:
 
 
 def _consistency(done: Sequence[Record]) -> Record:
-    """Return NIS by sensor, and ANEES by block with its verdicts."""
-    record: Record = dict.fromkeys(INNOVATIONS)
-    record |= {f"nis_{sensor}": float(nis.value[0]) for sensor, nis in pooled_nis(done).items()}
+    """Return NIS, log density and whiteness by sensor, and ANEES by block with its verdicts."""
+    record: Record = dict.fromkeys([*INNOVATIONS, *(f"{name}_outside" for name in WHITENESS)])
+    for score in ("nis", "log_density", "whiteness"):
+        record |= {f"{score}_{sensor}": value for sensor, (value, *_) in pooled(done, score).items()}
+    for sensor, average in pooled_whiteness(done).items():
+        record[f"whiteness_{sensor}_outside"] = bool(average.above[0] or average.below[0])
     found = anees_of([row["nees_at"] for row in done])
     for block in BLOCKS:
         average = found.get(block)
@@ -214,6 +217,7 @@ def consistency(rows: Rows) -> list[Record]:
         done = [row for row in group if row["status"] == "done"]
         named = {f"nees_{block}": average for block, average in anees_of([row["nees_at"] for row in done]).items()}
         named |= {f"nis_{sensor}": average for sensor, average in pooled_nis(done).items()}
+        named |= {f"whiteness_{sensor}": average for sensor, average in pooled_whiteness(done).items()}
         for name, average in named.items():
             for k in range(len(average)):
                 verdict = "above" if average.above[k] else "below" if average.below[k] else "inside"
@@ -228,4 +232,4 @@ def consistency(rows: Rows) -> list[Record]:
 def is_judged(summary: Sequence[Record]) -> bool:
     """Return whether a table of consistency is worth showing: there is NIS, or ANEES over enough seeds."""
     enough = [row["done"] >= SEEDS_ENOUGH and row["anees_times"] is not None for row in summary]
-    return any(enough) or any(row[name] is not None for row in summary for name in INNOVATIONS)
+    return any(enough) or any(row[name] is not None for row in summary for name in NIS)

@@ -19,6 +19,7 @@ from ..execution.sweep import run_experiment
 from ..experiment.plan import Experiment
 from ..files import write_csv
 from ..metrics import pooled_rmse
+from ..results.intervals import interval_over_seeds
 from ..results.summary import Record, groups, records
 from .printing import machine_text, made
 
@@ -35,8 +36,6 @@ COLUMNS = (
 )
 BEGIN, END = "<!-- cost: fathom timing cost -->", "<!-- /cost -->"
 """The table stands between these two lines of a page."""
-BOOTSTRAPS = 2000
-"""Resamples: the ends of a 95 % interval are then the 50th from either side."""
 
 
 def cost_records(rows: pd.DataFrame) -> list[Record]:
@@ -123,7 +122,7 @@ def _conditions(rows: pd.DataFrame, costs: Sequence[Record]) -> str:
 def draw_accuracy_cost(rows: pd.DataFrame) -> Figure:
     """Draw ATE against computing per second of voyage, a panel per log: online filled, smoothed open.
 
-    One look per estimator; its lags are joined. The bars are 95 % bootstrap intervals of the pooled RMSE.
+    One look per estimator; its lags are joined. The bars are 95 % intervals over seeds, where they are enough.
     """
     done = [row for row in records(rows) if row["status"] == "done" and row["ate_rmse_m"] is not None]
     looks = looks_of([name for (name,) in groups(done, "estimator")])
@@ -167,12 +166,9 @@ def _draw_line(axes: Any, rows: Sequence[Record], look: Look, online: bool) -> N
 
 
 def _pooled_with_interval(runs: Sequence[Record]) -> tuple[float, float, float]:
-    """Return the ATE pooled over the seeds, and its 95 % bootstrap interval; of one seed it has no width."""
-    rmse, n = (np.array([row[key] for row in runs], float) for key in ("ate_rmse_m", "n_scored"))
-    draws = np.random.default_rng(0).integers(0, len(runs), (BOOTSTRAPS, len(runs)))
-    pooled = np.sqrt((n * rmse**2)[draws].sum(axis=1) / n[draws].sum(axis=1))
-    low, high = np.percentile(pooled, [2.5, 97.5])
-    return pooled_rmse(list(rmse), list(n)), float(low), float(high)
+    """Return the ATE pooled over the seeds, and its 95 % interval; of few seeds it has no width."""
+    pooled = pooled_rmse([row["ate_rmse_m"] for row in runs], [row["n_scored"] for row in runs])
+    return pooled, *(interval_over_seeds(runs, "ate_rmse_m") or (pooled, pooled))
 
 
 def write_cost(rows: pd.DataFrame, folder: Path) -> list[Path]:

@@ -15,14 +15,13 @@ from ...datasets.log import Log
 from ...datasets.state import Array, TimeArray
 from ...estimators.interface import Estimator
 from ..drawing import WIDTH_IN, Look, empty_figure, handle, logarithmic
+from ..metrics.interval import interval
 from .passes import Stopwatch, quickest, stopwatch
 
 LAGS_S = (1.0, 3.0, 10.0, 30.0)
 """Each about three times the one before."""
 PIECES = 24
 """Pieces of equal length that a log is cut into: of 20 minutes, 50 s each, with 250 keyframes."""
-BOOTSTRAPS = 2000
-"""Resamples: the ends of a 95 % interval are then the 50th from either side."""
 TEN_MINUTES_S = 600.0
 """s."""
 
@@ -87,7 +86,7 @@ class Course:
     Attributes:
         t_s: (pieces,) middle of each piece of the log.
         ms_per_s: (pieces,) time of its steps, ms per second of voyage.
-        growth: increase in ten minutes, as a share of the mean, with its 95 % bootstrap interval over the pieces.
+        growth: increase in ten minutes, as a share of the mean, with its 95 % interval over the pieces.
     """
 
     t_s: Array
@@ -100,10 +99,8 @@ def course(steps: Steps, from_s: float, pieces: int = PIECES) -> Course:
     edges = np.linspace(from_s, float(steps.t_s[-1]), pieces + 1)
     cost = np.array([steps.ms_per_s(a, b) for a, b in pairwise(edges)])
     t_s = 0.5 * (edges[:-1] + edges[1:])
-    draws = np.random.default_rng(0).integers(0, pieces, (BOOTSTRAPS, pieces))
-    drawn = np.array([_growth(t_s[k], cost[k]) for k in draws])
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return Course(t_s, cost, (_growth(t_s, cost), float(low), float(high)))
+    growth = _growth(t_s, cost)
+    return Course(t_s, cost, (growth, *(interval((t_s, cost), _growth) or (growth, growth))))
 
 
 def _growth(t_s: Array, cost: Array) -> float:

@@ -14,21 +14,22 @@ from scipy.stats import chi2
 from ...datasets.errors import nearest
 from ...datasets.state import Array
 from ..errors import ExperimentError
-from ..metrics.bootstrap import bootstrap_interval
 from ..metrics.comparison import OVER_SEEDS
 from ..metrics.floor_ratio import FLOORS
-from ..metrics.scoring import INNOVATIONS, MEDIAN, POOLED
+from ..metrics.interval import interval
+from ..metrics.scoring import ELLIPSOIDS, MEDIAN, NIS, OF_ELLIPSOIDS, POOLED
 from ..results.paired import TAKE
 
 EXPECTED: dict[str, float] = (
-    dict.fromkeys(INNOVATIONS, 1.0)
+    dict.fromkeys(NIS, 1.0)
     | {f"nees_{block}": 3.0 for block in ("position", "attitude", "velocity")}
     | {"nees_biases": 6.0, "nees_all": 15.0}
-    | {f"within_{k}sigma_{of}": float(chi2.cdf(k**2, 1)) for k in (1, 2, 3) for of in ("position", "all")}
+    | {f"within_{k}sigma_{of}": float(chi2.cdf(k**2, 1)) for k in (1, 2, 3) for of in OF_ELLIPSOIDS}
+    | {f"inside_{percent}_{of}": percent / 100 for percent in ELLIPSOIDS for of in OF_ELLIPSOIDS}
 )
 """Expected values of consistency scores, for a consistent estimator."""
 
-SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(INNOVATIONS)
+SCORES = [name for name in OVER_SEEDS if name not in (*MEDIAN, *FLOORS)] + list(NIS)
 """Scores that a search can minimise. Costs do not depend on the noise, and the floor not on the estimator."""
 
 
@@ -63,7 +64,7 @@ class Objective:
     @property
     def needs_nis(self) -> bool:
         """Whether the score needs NIS."""
-        return self.score in INNOVATIONS
+        return self.score in NIS
 
     @property
     def is_distance(self) -> bool:
@@ -100,11 +101,11 @@ class Objective:
         return np.abs(np.log(score / EXPECTED[self.score])) if self.is_distance else score
 
     def interval(self, marks: Marks) -> tuple[float, float] | None:
-        """Return the 95 % bootstrap interval over runs of the score; None where they are too few."""
-        return bootstrap_interval(tuple(marks), self.taken)
+        """Return the 95 % interval over runs of the score; None where they are too few."""
+        return interval(tuple(marks), self.taken, positive=True)
 
     def gain(self, tuned: Marks, sheet: Marks) -> tuple[float, tuple[float, float] | None]:
-        """Return the gain of the tuned over the data sheet, and its 95 % bootstrap interval, paired by run.
+        """Return the gain of the tuned over the data sheet, and its 95 % interval, paired by run.
 
         The gain is the loss of the data sheet less that of the tuned, or the logarithm of their ratio where the loss is
         no distance: 0.1 is a tenth less either way.
@@ -115,7 +116,7 @@ class Objective:
             return of_b - of_v if self.is_distance else np.log(of_b / of_v)
 
         data = (tuned.values, tuned.weights, sheet.values, sheet.weights)
-        return float(less(*data)), bootstrap_interval(data, less)
+        return float(less(*data)), interval(data, less)
 
     def gain_of(self, tuned: float, sheet: float) -> float:
         """Return the gain between two losses."""

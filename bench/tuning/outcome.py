@@ -20,7 +20,7 @@ from rich.text import Text
 from ..drawing import PALETTE, WIDTH_IN, empty_figure, handle, logarithmic, save
 from ..errors import ExperimentError
 from ..files import writing
-from ..metrics.bootstrap import FEWEST_SEEDS
+from ..metrics.interval import FEWEST_SEEDS
 from ..output.tables import terminal
 from .objective import EXPECTED, Marks
 from .search import Search, Trial, best_of

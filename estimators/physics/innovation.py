@@ -1,7 +1,8 @@
-"""Innovations: a reading against the belief before it, and their normalised square, NIS; docs/conventions.md (37)."""
+"""Innovations: a reading against the belief before it: their NIS, docs/conventions.md (37), and their density (67)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,9 +12,14 @@ from numpy.typing import NDArray
 from ...datasets.compiling.decorators import compiled
 from ...datasets.epochs import SENSOR
 from ...datasets.state import DIM, Array, Belief
-from .elimination import normalised_square, project
+from .elimination import decorrelate, project
 from .measurements import measure
 from .state import as_record
+
+LOG_2PI = math.log(2.0 * math.pi)
+"""Of a normal density, twice per component."""
+TINY = np.finfo(np.float64).tiny
+"""A variance that is not positive has no logarithm; the square beside it is NaN then."""
 
 INNOVATION = np.dtype(
     [
@@ -21,6 +27,8 @@ INNOVATION = np.dtype(
         ("t_ns", "i8"),  # when it was true
         ("dof", "i8"),  # components it measured
         ("nis", "f8"),  # normalised innovation squared: for a consistent belief, chi-square with dof degrees of freedom
+        ("log_density", "f8"),  # of the reading as predicted, nats; its units are m, rad and m/s
+        ("white", "f8", 3),  # the innovation with its covariance divided out; for a consistent belief N(0, I)
     ]
 )
 
@@ -41,7 +49,7 @@ def gate_widths(gate: Mapping[str, float]) -> Array:
 
 
 def innovations(belief: Belief, readings: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
-    """Judge a belief by readings that it has not seen: rᵀ S⁻¹ r of each by itself, with S = H P Hᵀ + C.
+    """Judge a belief by readings that it has not seen, each by itself: of its residual r, with S = H P Hᵀ + C.
 
     Args:
         belief: at the readings' time; its velocity has the rate noise of the IMU's lever arm in it (`with_rate_noise`).
@@ -50,8 +58,8 @@ def innovations(belief: Belief, readings: NDArray[Any], rig: NDArray[Any]) -> ND
             rate_cov must still be zero: the rate noise is in the belief, and would count twice.
 
     Returns:
-        INNOVATION rows of the readings that measure anything. nis is NaN where the belief has no covariance, or one
-        under which S is not positive.
+        INNOVATION rows of the readings that measure anything. nis and log_density are NaN where the belief has no
+        covariance, or one under which S is not positive.
 
     Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2.
     """
@@ -63,7 +71,7 @@ def innovations(belief: Belief, readings: NDArray[Any], rig: NDArray[Any]) -> ND
 
 @compiled
 def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table: NDArray[Any]) -> None:
-    """Fill dof and nis of a table of INNOVATION rows, one per reading; state and rig are records of length 1."""
+    """Fill a table of INNOVATION rows, one per reading; state and rig are records of length 1."""
     r, H, S, PH = np.empty(3), np.empty((3, DIM)), np.empty((3, 3)), np.empty(DIM)
     for m in range(len(readings)):
         n, largest = measure(readings, m, state, rig, r, H, S), 0.0
@@ -76,4 +84,10 @@ def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table:
             for k in range(i):
                 S[k, i] = S[i, k]
         if largest > 0.0:  # a yaw looked at from the pole measures nothing
-            table[m].dof, table[m].nis = n, normalised_square(n, r, H, S)
+            decorrelate(n, r, H, S)
+            t = table[m]
+            t.dof, t.nis, t.log_density = n, 0.0, -0.5 * n * LOG_2PI
+            for i in range(n):
+                t.white[i] = r[i] / math.sqrt(S[i, i]) if S[i, i] > 0.0 else np.nan
+                t.nis += t.white[i] * t.white[i]
+                t.log_density -= 0.5 * (t.white[i] * t.white[i] + math.log(max(S[i, i], TINY)))

@@ -10,14 +10,13 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from ...drawing import TEXT_PT, TITLE_PT, WIDTH_IN, Look, empty_figure, legend_below, logarithmic, narrow, title_above
+from ...results.paired import ALPHA
 from ...results.summary import Record, groups
 from ..cells import ONLINE, SMOOTHED, column, percent
 from ..sheets import variant
 
 BAR = 0.72
 """Height of a bar, in lines."""
-ALPHA = 0.05
-"""Level of the test, the customary one."""
 WIDE = 4.0
 """Where ratios span more than this factor, their axis is logarithmic: bars near 1 would be too short to see."""
 LETTERS = 30

@@ -136,7 +136,7 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
         accuracy=[sheets.accuracy(of, done) for of in by_log.values()],
         over_floor=_there(map(sheets.over_floor, by_log.values())),
         differences=sheets.differences(differences),
-        consistency=_there(map(sheets.consistency, by_log.values())),
+        consistency=_there(of(each) for each in by_log.values() for of in (sheets.consistency, sheets.prediction)),
         late=_there(map(sheets.late_or_out, by_log.values())),
         costs=_there(map(sheets.cost, by_log.values())),
         logs=logs,

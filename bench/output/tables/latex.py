@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from ...metrics.bootstrap import FEWEST_SEEDS
+from ...metrics.interval import FEWEST_SEEDS, HOLDS
 from ...results.intervals import TABLED, summarise_with_intervals
 from ...results.step_time import machine_name
 from ...results.summary import UNFINISHED, Record, Rows, file_names, groups, records
@@ -150,10 +150,7 @@ def _caption(summary: Sequence[Record], rows: Sequence[Record]) -> str:
     if len(seeds) > 1:
         sentences.append("RMSEs are pooled over seeds before the root; drift and NEES are means, costs medians")
     if _has_intervals(summary):
-        sentences.append(
-            "Beside a number: the ends of its 95 % interval, minus the number"
-            " (bootstrap over seeds, bias-corrected and accelerated)"
-        )
+        sentences.append(f"Beside a number: the ends of its 95 % interval over seeds, minus the number; it {HOLDS}")
     elif len(seeds) > 1:
         sentences.append(f"Intervals need {FEWEST_SEEDS} seeds")
     sentences.append(NEES_NOTE)

@@ -73,14 +73,15 @@ def print_table(rows: Rows, console: Console | None = None, differences: Sequenc
 def print_logs(rows: Rows, console: Console) -> None:
     """Print the tables of each log, but of none whose recording is not here.
 
-    Accuracy and cost for every log; the floor where it was asked for; consistency where NIS was asked for, or seeds are
-    enough for ANEES; late readings and outliers where there were any.
+    Accuracy and cost for every log; the floor where it was asked for; consistency and what was predicted where NIS was
+    asked for, or seeds are enough for ANEES; late readings and outliers where there were any.
     """
     every = records(rows)
     here = [row for row in every if row["status"] != "absent"]
     for summary in groups(summarise(every if len(here) == len(every) else here), "log").values():
         found = [sheets.accuracy(summary), sheets.over_floor(summary)]
-        found += [sheets.consistency(summary) if is_judged(summary) else None, sheets.late_or_out(summary)]
+        found += [sheets.consistency(summary), sheets.prediction(summary)] if is_judged(summary) else []
+        found.append(sheets.late_or_out(summary))
         for sheet in found:
             if sheet is not None:
                 print_sheet(sheet, console)

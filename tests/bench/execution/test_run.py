@@ -12,6 +12,7 @@ import pytest
 from fathom.bench.execution.drive import run_log, score_ticks, warm_up
 from fathom.bench.execution.result import costs, innovation_dof, innovation_scores
 from fathom.bench.execution.task import parquet
+from fathom.bench.metrics.energy_score import energy_score
 from fathom.bench.metrics.scoring import COSTS, INNOVATIONS, SCORES, Scoring, scores
 from fathom.datasets import Belief, Log, NavState, Rig, Trajectory
 from fathom.datasets.epochs import Epoch
@@ -331,6 +332,10 @@ def test_nees_of_every_block_and_coverage_are_of_the_errors_there_are(log: Log) 
     assert [row[f"nees_{block}"] for block in ("attitude", "velocity", "biases")] == pytest.approx([0] * 3, abs=1e-9)
     assert [row[f"within_{k}sigma_position"] for k in (1, 2, 3)] == pytest.approx([1 / 3, 2 / 3, 1])
     assert [row[f"within_{k}sigma_all"] for k in (1, 2, 3)] == pytest.approx([13 / 15, 14 / 15, 1])
+    assert [row[f"inside_{percent}_position"] for percent in (50, 90, 99)] == [0, 0, 1]  # P(χ²₃ < 35/4) is 0.967
+    assert [row[f"inside_{percent}_all"] for percent in (50, 90, 99)] == [1, 1, 1]  # P(χ²₁₅ < 35/4) is 0.11
+    sphere = energy_score(np.array([[1.0, 3.0, 5.0]]), 4 * np.eye(3)[None])
+    assert row["energy_score_m"] == pytest.approx(sphere[0])
     assert row["n_not_positive"] == 0
 
 
@@ -351,8 +356,11 @@ def test_a_covariance_kept_now_and_then_is_judged_then(log: Log) -> None:
     row = scores(log, replace(online, P=P))
     assert row["nees_all"] == pytest.approx(35 / 4)
     assert row["within_1sigma_position"] == pytest.approx(1 / 3)
+    assert [row[f"inside_{percent}_position"] for percent in (50, 90, 99)] == [0, 0, 1]
     nowhere = scores(log, replace(online, P=P * np.nan))
-    assert [nowhere[name] for name in ("nees_all", "within_1sigma_all")] == [None, None]
+    assert [nowhere[name] for name in ("nees_all", "within_1sigma_all", "inside_50_all", "energy_score_m")] == [
+        None
+    ] * 4
 
 
 @dataclass(frozen=True)

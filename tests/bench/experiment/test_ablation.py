@@ -402,3 +402,16 @@ def test_a_task_knows_its_variant(folder: Path) -> None:
     row = Task.of(plan, plan.runs()[1]).row("done", None)
     assert (row["label"], row["estimator"]) == ("eskf no dvl", "eskf")
     assert '"factors": ["depth", "gps", "heading"]' in row["spec"]
+
+
+def test_a_run_compared_with_itself_is_no_test() -> None:
+    scenario = SHORT | {"gps": None}
+    plan = experiment(
+        logs=[{"name": "l", "scenario": scenario}],
+        estimators=[{"name": "eskf", "drop": ["gps", "dvl"]}, {"name": "eskf", "label": "again", "baseline": "eskf"}],
+        compare=["ate_rmse_m", "heading_rmse_deg"],
+    )
+    assert len(plan.comparisons()) == 3
+    assert plan.least_tests() == 2  # without the DVL, in two scores: the log has no GPS anyway
+    two_logs = [{"name": "l", "scenario": SHORT}, {"name": "m", "scenario": scenario, "baseline": "l"}]
+    assert experiment(logs=two_logs, compare=["ate_rmse_m"]).least_tests() == 1

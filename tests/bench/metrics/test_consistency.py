@@ -10,12 +10,23 @@ import pytest
 from fathom.bench.execution.drive import run_log
 from fathom.bench.execution.result import innovation_dof, innovation_scores
 from fathom.bench.metrics import BLOCKS, DOF, associate, consistency, nees
-from fathom.bench.metrics.consistency import FALSE_ALARM, anees, anees_of, interval, nees_at, pooled_nis
+from fathom.bench.metrics.consistency import (
+    FALSE_ALARM,
+    anees,
+    anees_of,
+    autocorrelation,
+    interval,
+    nees_at,
+    pooled_nis,
+    pooled_whiteness,
+)
+from fathom.bench.metrics.scoring import ELLIPSOIDS
+from fathom.bench.metrics.state_error import share_inside
 from fathom.datasets import Log
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.estimators import create
-from scipy.stats import binom, chi2
+from scipy.stats import binom, chi2, norm
 
 TIMES = np.arange(10.0)
 
@@ -134,27 +145,68 @@ def test_nis_is_pooled_by_degrees_of_freedom() -> None:
     assert found["dvl"].above.all()
 
 
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_ellipsoids_hold_the_share_of_draws_that_they_claim(scale: float) -> None:
+    """Of correlated errors; where the covariance is a quarter of what it should be, by the law of the larger errors."""
+    rng, n = np.random.default_rng(8), 5000
+    root = rng.normal(size=(3, 3)) * [0.1, 1, 10]
+    e = np.sqrt(scale) * rng.normal(size=(n, 3)) @ root.T
+    squares = np.append(np.einsum("ni,ij,nj->n", e, np.linalg.inv(root @ root.T), e), np.nan)
+    for percent in ELLIPSOIDS:
+        due = chi2.cdf(chi2.ppf(percent / 100, 3) / scale, 3)
+        low, high = binom.interval(0.999, n, due)
+        assert low <= n * share_inside(squares, 3, percent / 100) <= high
+
+
+def test_the_whiteness_of_a_known_process_is_its_coefficient() -> None:
+    rng, n = np.random.default_rng(6), 4000
+    for coefficient in (-0.5, 0.0, 0.3, 0.9):
+        x = np.zeros((n, 2))
+        for k in range(1, n):
+            x[k] = coefficient * x[k - 1] + rng.normal(size=2)
+        sigma = np.sqrt((1 - coefficient**2) / (2 * n))
+        assert autocorrelation(x) == pytest.approx(coefficient, abs=4 * sigma)
+        assert autocorrelation(7 * x) == pytest.approx(autocorrelation(x))
+    assert autocorrelation(np.ones((1, 3))) is None
+    assert autocorrelation(np.zeros((5, 3))) is None
+
+
+def test_white_innovations_are_called_coloured_as_seldom_as_stated() -> None:
+    rng, outside = np.random.default_rng(7), 0
+    for _ in range(2000):
+        runs = [{"nis_dof": '{"dvl": 300}', "whiteness_dvl": autocorrelation(rng.normal(size=(100, 3)))}]
+        runs += [{"nis_dof": '{"dvl": 150}', "whiteness_dvl": autocorrelation(rng.normal(size=(50, 3)))}]
+        average = pooled_whiteness(runs)["dvl"]
+        assert average.dof.tolist() == [450]
+        outside += int(average.above[0] or average.below[0])
+    assert outside <= binom.ppf(0.999, 2000, FALSE_ALARM)
+    assert average.high[0] == -average.low[0] == pytest.approx(norm.ppf(1 - FALSE_ALARM / 2) / np.sqrt(450))
+
+
 # -- filters told right and wrong noise -------------------------------------------------------------------------------
 
 
-def voyages(name: str, **options: object) -> tuple[dict[str, consistency.Average], dict[str, consistency.Average]]:
-    """NIS and ANEES of 20 seeds of a minute."""
+Averages = dict[str, consistency.Average]
+
+
+def voyages(name: str, **options: object) -> tuple[Averages, Averages, Averages]:
+    """NIS, ANEES and whiteness of 20 seeds of a minute."""
     runs, at = [], []
     for seed in range(20):
         log = simulate(Scenario(duration_s=60.0, surface_for_s=60.0), seed)
         result = run_log(log, create(name, **options), nis=True)
         runs.append(innovation_scores(result) | {"nis_dof": json.dumps(innovation_dof(result))})
         at.append(json.dumps(nees_at(log, result.online, 10)))
-    return pooled_nis(runs), anees_of(at)
+    return pooled_nis(runs), anees_of(at), pooled_whiteness(runs)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["eskf", "iekf", "fls"])
 def test_an_estimator_with_the_right_noise_is_consistent(name: str) -> None:
-    nis, nees = voyages(name)
+    nis, nees, white = voyages(name)
     assert set(nis) == {"dvl", "depth", "gps", "heading"}
     assert nis["dvl"].dof[0] == 20 * 60 * 5 * 3
-    for sensor, average in nis.items():
+    for sensor, average in (*nis.items(), *white.items()):
         assert not (average.above | average.below).any(), (sensor, average)
     for block, average in nees.items():
         assert average.runs.tolist() == [20] * 10
@@ -163,9 +215,11 @@ def test_an_estimator_with_the_right_noise_is_consistent(name: str) -> None:
 
 @pytest.mark.slow
 def test_who_takes_the_dvl_for_three_times_better_than_it_is_gives_itself_away() -> None:
-    nis, nees = voyages("eskf", inflate={"dvl": 0.3})
+    nis, nees, white = voyages("eskf", inflate={"dvl": 0.3})
+    assert white["dvl"].below[0]  # each correction goes too far, and the next innovation back
     assert nis["dvl"].value[0] > 3
     assert nis["depth"].value[0] == pytest.approx(1, abs=0.1)
     assert nees["velocity"].above.sum() >= 8
-    modest, _ = voyages("eskf", inflate={"dvl": 3.0})
+    modest, _, late = voyages("eskf", inflate={"dvl": 3.0})
     assert modest["dvl"].value[0] < 0.5
+    assert late["dvl"].above[0]

@@ -75,7 +75,7 @@ def test_what_needs_no_alignment_is_scored_where_none_is_determined() -> None:
 
 def test_the_names_of_the_parts_are_scores() -> None:
     names = [name for part in (ALIGNED | ANYWAY).values() for name in part]
-    judged = [name for name in SCORES if name.startswith(("nees_", "within_", "n_not_positive"))]
+    judged = [name for name in SCORES if name.startswith(("nees_", "within_", "inside_", "energy_", "n_not_positive"))]
     assert sorted([*names, *judged, "n_scored"]) == sorted(SCORES)
 
 

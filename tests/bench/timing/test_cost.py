@@ -12,7 +12,9 @@ from fathom.bench.cli.app import app
 from fathom.bench.execution.task import Task
 from fathom.bench.execution.worker import WorkerCache
 from fathom.bench.experiment.plan import Experiment
+from fathom.bench.results.intervals import interval_over_seeds
 from fathom.bench.results.store import COLUMNS
+from fathom.bench.results.summary import records
 from fathom.bench.timing.cost import BEGIN, END, LAGS_S, cost_markdown, cost_records, draw_accuracy_cost, write_cost
 from fathom.bench.timing.cost import COLUMNS as HEADINGS
 from fathom.estimators import ESTIMATORS
@@ -80,12 +82,17 @@ def test_the_table_has_a_line_for_each_estimator_and_names_the_machine(rows: pd.
 
 
 def test_the_figure_holds_every_output_with_its_seeds_interval(rows: pd.DataFrame) -> None:
-    (axes,) = draw_accuracy_cost(rows).axes
+    five = pd.concat(
+        [rows[rows["seed"] == 1].assign(seed=s, ate_rmse_m=lambda of, s=s: of["ate_rmse_m"] * 1.1**s) for s in range(5)]
+    )
+    (axes,) = draw_accuracy_cost(five).axes
     drawn = [container for container in axes.containers if container.get_label() != "no"]
     assert len(drawn) == 5  # online: eskf, window, rts; smoothed: window, rts
-    ate = rows[(rows["label"] == "eskf")]["ate_rmse_m"]
     (segment,) = drawn[0].lines[2][0].get_segments()  # type: ignore[index]
-    assert ate.min() - 1e-9 <= segment[0][1] < segment[1][1] <= ate.max() + 1e-9
+    expected = interval_over_seeds(records(five[five["label"] == "eskf"]), "ate_rmse_m")
+    assert (segment[0][1], segment[1][1]) == pytest.approx(expected)
+    (alone,) = draw_accuracy_cost(rows).axes[0].containers[0].lines[2][0].get_segments()  # type: ignore[index]
+    assert alone[0][1] == alone[1][1]  # of two seeds there is none
 
 
 def test_what_is_written_can_be_read_again(rows: pd.DataFrame, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from fathom.estimators.physics.innovation import innovations
 from fathom.estimators.physics.state import as_record, with_rate_noise
 from linear import TOY_RIG, linear_toy
 from paths import NOISE, random_rig, random_rotation, random_state, reading
-from scipy.stats import chi2
+from scipy.stats import chi2, multivariate_normal
 
 SENSORS = ("dvl", "depth", "gps", "heading", "heading")
 
@@ -38,7 +38,7 @@ def random_readings(rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_nis_is_the_quadratic_form_written_out(seed: int) -> None:
+def test_nis_and_density_are_the_forms_written_out(seed: int) -> None:
     rng = np.random.default_rng(seed)
     belief, readings = random_belief(rng), random_readings(rng)
     rig = compile_rig(random_rig(rng), FACTORS, {"dvl": 2.0, "heading": 0.5})
@@ -48,7 +48,12 @@ def test_nis_is_the_quadratic_form_written_out(seed: int) -> None:
     for k, row in enumerate(table):
         r, H, C = stack(as_record(belief), rig, readings[k : k + 1])
         assert np.allclose(np.sqrt(np.diag(C)), rig["inflate"][0, row["kind"]] * readings["sigma"][k][: len(r)])
-        assert row["nis"] == pytest.approx(r @ np.linalg.solve(H @ belief.P @ H.T + C, r), rel=1e-9)
+        S = H @ belief.P @ H.T + C
+        assert row["nis"] == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-9)
+        assert row["log_density"] == pytest.approx(multivariate_normal(cov=S).logpdf(r), rel=1e-9)
+        white = row["white"][: len(r)]
+        assert white == pytest.approx(np.linalg.solve(np.linalg.cholesky(S), r), rel=1e-9)
+        assert not row["white"][len(r) :].any()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -76,8 +81,9 @@ def test_what_measures_nothing_has_no_innovation_and_what_is_no_covariance_no_ni
     assert not len(innovations(Belief(0, upright, belief.P), yaw, compile_rig(Rig(NOISE), FACTORS, {})))
     P = belief.P.copy()
     P[VELOCITY, VELOCITY] -= 100 * np.eye(3)
-    nis = innovations(replace(belief, P=P), readings, compile_rig(rig, FACTORS, {}))["nis"]
-    assert np.isnan(nis).tolist() == [True, False, False, False, False]
+    table = innovations(replace(belief, P=P), readings, compile_rig(rig, FACTORS, {}))
+    for name in ("nis", "log_density"):
+        assert np.isnan(table[name]).tolist() == [True, False, False, False, False]
     assert np.isnan(innovations(replace(belief, P=P * np.nan), readings, compile_rig(rig, FACTORS, {}))["nis"]).all()
 
 
