@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from ..quantities import DEGREE, STRICT, Finite, NotNegative, Number, Positive, Probability, Vector
 from ..rig import Mounting
 from ..state import Array, TimeArray
-from .random_streams import random_stream
 
 LONGEST_CLOCK_OFFSET_S = 5.0
 """Largest clock offset, s: well inside the margin of a mission's splines beyond both its ends."""
@@ -207,11 +206,10 @@ def true_mounting(stated: Mounting, faults: AnyFaults) -> Mounting:
     return Mounting(R_BS, p_BS_B)
 
 
-def mar(z: Array, faults: AnyFaults, sensor: str, seed: int) -> Array:
+def mar(z: Array, faults: AnyFaults, rng: np.random.Generator) -> Array:
     """Return readings z (n, k) with outliers added, then clipped, then rounded."""
     outlier, limit, quantum = faults.marring
     if faults.outlier_probability:
-        rng = random_stream(seed, f"{sensor}_outliers")
         hit = rng.random(len(z)) < faults.outlier_probability
         z = z + hit[:, None] * outlier * rng.standard_normal(z.shape)
     if np.isfinite(limit).any():
@@ -222,20 +220,20 @@ def mar(z: Array, faults: AnyFaults, sensor: str, seed: int) -> Array:
     return z
 
 
-def arrives(t_ns: TimeArray, faults: AnyFaults, sensor: str, seed: int) -> NDArray[np.bool_]:
+def arrives(t_ns: TimeArray, faults: AnyFaults, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return which readings (n,) are neither dropped nor stamped in an outage; t_ns is from the log's start."""
     heard = np.ones(len(t_ns), bool)
     if faults.dropout_probability:
-        heard &= random_stream(seed, f"{sensor}_dropouts").random(len(t_ns)) >= faults.dropout_probability
+        heard &= rng.random(len(t_ns)) >= faults.dropout_probability
     for begin_s, end_s in faults.outages_s:
         heard &= ~((t_ns >= begin_s * 1e9) & (t_ns <= end_s * 1e9))
     return heard
 
 
-def repeated(heard: NDArray[np.bool_], faults: AnyFaults, sensor: str, seed: int) -> TimeArray:
+def repeated(heard: NDArray[np.bool_], faults: AnyFaults, rng: np.random.Generator) -> TimeArray:
     """Return, for each reading that is heard, the row (of all) whose values it carries: its own or an earlier one."""
     rows = np.flatnonzero(heard)
     if not (faults.repeat_probability and len(rows)):
         return rows
-    fresh = random_stream(seed, f"{sensor}_repeats").random(len(heard))[rows] >= faults.repeat_probability
+    fresh = rng.random(len(heard))[rows] >= faults.repeat_probability
     return rows[np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), 0))]

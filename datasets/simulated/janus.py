@@ -39,7 +39,7 @@ def read_dvl(
     v_WD_D = spec.faults.scale * v_WD_B @ dvl.R_BS
 
     A = janus_beams(spec.beam_angle_deg * DEGREE)
-    beam_error = spec.beam_sigma_m_s * random_stream(seed, "dvl").standard_normal((len(t_s), 4))
+    beam_error = spec.beam_sigma_m_s * random_stream(scenario.mission, "dvl", seed).standard_normal((len(t_s), 4))
     error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, spec.beam_sigma_m_s), (len(t_s), 1))
     if scenario.seabed is None and spec.max_tilt_deg is None and not spec.beam_loss_probability:
         return v_WD_D, error, sigma
@@ -68,5 +68,7 @@ def bottom_lock(scenario: Scenario, spec: DvlSpec, R_WD: Array, p_WD_W: Array, s
         range_m = scenario.seabed.ranges(p_WD_W, beams_W)
         locked &= (range_m >= spec.min_range_m) & (range_m <= spec.max_range_m)
     if spec.beam_loss_probability:
-        locked &= random_stream(seed, "dvl_beams").random((len(R_WD), 4)) >= spec.beam_loss_probability
+        locked &= (
+            random_stream(scenario.mission, "dvl_beams", seed).random((len(R_WD), 4)) >= spec.beam_loss_probability
+        )
     return locked

@@ -56,7 +56,7 @@ class Sea:
         share = (np.arange(COMPONENTS) + 0.5) / COMPONENTS
         frequency = 2 * math.pi / waves.period_s * (-0.8 * np.log(share)) ** -0.25
         amplitude = np.full(COMPONENTS, waves.height_m / 4 * math.sqrt(2 / COMPONENTS))
-        phase = random_stream(seed, "waves").uniform(0, 2 * math.pi, COMPONENTS)
+        phase = random_stream(scenario.mission, "waves", seed).uniform(0, 2 * math.pi, COMPONENTS)
         towards = waves.towards_deg * DEGREE
         direction = np.array([math.cos(towards), math.sin(towards)])
         return cls(amplitude, frequency, phase, direction, gravity, scenario.tide)

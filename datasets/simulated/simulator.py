@@ -22,7 +22,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
 
     Args:
         scenario: what to simulate.
-        seed: of every random stream.
+        seed: of every random stream of this mission; another mission has others.
         path: what the mission "recorded" follows, in place of the scenario's file.
 
     Raises:
@@ -32,7 +32,8 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         raise DatasetError("simulate: seed must be from 0 to 2^63 − 1")
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
     edges_ns = np.concatenate([[0], ticks(scenario.imu.rate_hz, scenario.duration_s)])
-    biases = simulate_biases(rig.imu_noise, edges_ns, seed, scenario.imu.bias_correlation_s) * scenario.noise_scale
+    rng = random_stream(scenario.mission, "imu_bias", seed)
+    biases = simulate_biases(rig.imu_noise, edges_ns, rng, scenario.imu.bias_correlation_s) * scenario.noise_scale
 
     R_WB, p_WB_W, v_WB_W = motion.pose(edges_ns * 1e-9)
     truth = Trajectory(start_ns + edges_ns, R_WB, p_WB_W, v_WB_W, b_a=biases[:, :3], b_g=biases[:, 3:])
@@ -71,6 +72,6 @@ def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
     sigma[ACCEL_BIAS] = noise.accel_bias_sigma
     sigma[GYRO_BIAS] = noise.gyro_bias_sigma
     state = truth.state(0)
-    error = random_stream(seed, "prior").standard_normal(DIM) * sigma * scenario.noise_scale
+    error = random_stream(scenario.mission, "prior", seed).standard_normal(DIM) * sigma * scenario.noise_scale
     error[ACCEL_BIAS], error[GYRO_BIAS] = state.b_a, state.b_g
     return Belief(int(truth.t_ns[0]), state.retract(-error), np.diag(sigma**2))

@@ -1,6 +1,7 @@
 """The simulator against the definitions: what an IMU's companions report, how noisy they are, and what a seed fixes."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from fathom.datasets.simulated.specs import (
 )
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, kstest, uniform
+from scipy.stats import chi2, kstest, pearsonr, uniform
 
 SENSORS = ("dvl", "depth", "gps", "heading")
 
@@ -237,14 +238,32 @@ def test_changing_the_imu_changes_neither_path_nor_aiding():
 
 
 def test_a_longer_log_begins_with_the_same_noise():
-    short, long = (simulate_biases(IMU_GRADES["tactical"], np.arange(n) * 10_000_000, 3) for n in (100, 200))
+    short, long = (
+        simulate_biases(IMU_GRADES["tactical"], np.arange(n) * 10_000_000, np.random.default_rng(3)) for n in (100, 200)
+    )
     assert np.array_equal(short, long[:100])
 
 
 def test_random_streams_are_distinct():
     assert len(set(RANDOM_STREAMS.values())) == len(RANDOM_STREAMS)
-    draws = [random_stream(seed, cause).random() for seed in range(5) for cause in RANDOM_STREAMS]
+    keys = itertools.product([*MISSIONS, "recorded"], RANDOM_STREAMS, [0, 1, 2**32, 2**63 - 1])
+    draws = [random_stream(*key).random() for key in keys]
     assert len(set(draws)) == len(draws)
+
+
+def test_two_missions_of_one_seed_are_two_experiments():
+    """Not one error of any sensor, of the biases or of the prior is shared, nor correlated."""
+    noisy, quiet = (
+        [simulate(Scenario(mission=mission, duration_s=60, noise_scale=scale), 7) for mission in ("box", "transit")]
+        for scale in (1.0, 0.0)
+    )
+    for name in ("imu.w", "imu.f", "dvl.z", "depth.z", "heading.z"):
+        box, transit = (
+            np.diff(arrays(log)[name] - arrays(still)[name], axis=0) for log, still in zip(noisy, quiet, strict=True)
+        )
+        assert abs(pearsonr(box.ravel(), transit.ravel()).statistic) < 4 / np.sqrt(box.size), name
+    for one in (lambda log: log.truth.b_g[0], lambda log: log.prior.state.local(log.truth.state(0))):
+        assert not np.intersect1d(*map(one, noisy)).any()
 
 
 # -- the log as a whole
