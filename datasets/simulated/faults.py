@@ -1,7 +1,7 @@
-"""Faults of simulated sensors, unknown to estimators.
+"""Faults of simulated sensors: all that a sensor does and its log never tells.
 
-Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig. They keep
-their size when a scenario scales its noise.
+Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig nor a stated
+sigma. They keep their size when a scenario scales its noise.
 """
 
 from __future__ import annotations
@@ -133,11 +133,17 @@ class HeadingFaults(Faults):
     """Of a heading sensor.
 
     Attributes:
+        bias_deg: added to every heading.
+        soft_iron_deg, soft_iron_axis_deg: it adds soft_iron_deg · sin 2(ψ − soft_iron_axis_deg), the quadrantal
+            deviation of a compass.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
         quantum_deg: its resolution.
     """
 
     outlier_deg: NotNegative = 45.0
+    bias_deg: Finite = 0.0
+    soft_iron_deg: NotNegative = 0.0
+    soft_iron_axis_deg: Finite = 0.0
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
     quantum_deg: NotNegative = 0.0
 
@@ -152,6 +158,8 @@ class ImuFaults(Faults):
     """Of an IMU; a reading is one sample of its gyro and its accelerometer.
 
     Attributes:
+        bias_correlation_s: of biases that are first-order Gauss–Markov processes, where the rig says that they walk;
+            None: they do walk.
         gyro_scale, accel_scale: of what each axis reads to the truth, before bias and noise.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
         lever_arm_error_m: where it really is, less where the rig says, in B.
@@ -159,6 +167,7 @@ class ImuFaults(Faults):
         gyro_quantum_deg_s, accel_quantum_m_s2: to the nearest multiple of which a sample is rounded.
     """
 
+    bias_correlation_s: Positive | None = None
     gyro_outlier_deg_s: NotNegative = 20.0
     accel_outlier_m_s2: NotNegative = 5.0
     gyro_scale: Vector = (1.0, 1.0, 1.0)

@@ -7,7 +7,7 @@ import numpy as np
 from ..errors import DatasetError
 from ..log import DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..quantities import DEGREE
-from ..state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Belief
+from ..state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief
 from ..trajectory import Trajectory
 from .imu import sample_imu, simulate_biases
 from .missions import fly
@@ -15,6 +15,7 @@ from .notes import scenario_notes
 from .random_streams import random_stream
 from .readings import read, ticks
 from .scenario import Scenario
+from .specs import ImuSpec, PriorSpec, as_told
 
 
 def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Log:
@@ -33,7 +34,8 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
     edges_ns = np.concatenate([[0], ticks(scenario.imu.rate_hz, scenario.duration_s)])
     rng = random_stream(scenario.mission, "imu_bias", seed)
-    biases = simulate_biases(rig.imu_noise, edges_ns, rng, scenario.imu.bias_correlation_s) * scenario.noise_scale
+    biases = simulate_biases(scenario.imu.figures, edges_ns, rng, scenario.imu.faults.bias_correlation_s)
+    biases *= scenario.noise_scale
 
     R_WB, p_WB_W, v_WB_W = motion.pose(edges_ns * 1e-9)
     truth = Trajectory(start_ns + edges_ns, R_WB, p_WB_W, v_WB_W, b_a=biases[:, :3], b_g=biases[:, 3:])
@@ -60,18 +62,24 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
 
 
 def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
-    """Return the belief at the start: its mean is the truth less one draw of the error that its P states.
+    """Return the belief at the start: its mean is the truth less one draw of the error.
 
     The biases' means are zero: their errors were drawn at turn-on.
     """
-    noise, prior = scenario.imu.figures, scenario.prior
+    state = truth.state(0)
+    error = random_stream(scenario.mission, "prior", seed).standard_normal(DIM)
+    error *= prior_sigma(scenario.imu, scenario.prior) * scenario.noise_scale
+    error[ACCEL_BIAS], error[GYRO_BIAS] = state.b_a, state.b_g
+    told = prior_sigma(as_told(scenario.imu), as_told(scenario.prior))
+    return Belief(int(truth.t_ns[0]), state.retract(-error), np.diag(told**2))
+
+
+def prior_sigma(imu: ImuSpec, prior: PriorSpec) -> Array:
+    """Return the standard deviations of the error state at the start, (15,)."""
     sigma = np.empty(DIM)
     sigma[THETA] = prior.attitude_deg * DEGREE
     sigma[POSITION] = prior.position_m
     sigma[VELOCITY] = prior.velocity_m_s
-    sigma[ACCEL_BIAS] = noise.accel_bias_sigma
-    sigma[GYRO_BIAS] = noise.gyro_bias_sigma
-    state = truth.state(0)
-    error = random_stream(scenario.mission, "prior", seed).standard_normal(DIM) * sigma * scenario.noise_scale
-    error[ACCEL_BIAS], error[GYRO_BIAS] = state.b_a, state.b_g
-    return Belief(int(truth.t_ns[0]), state.retract(-error), np.diag(sigma**2))
+    sigma[ACCEL_BIAS] = imu.figures.accel_bias_sigma
+    sigma[GYRO_BIAS] = imu.figures.gyro_bias_sigma
+    return sigma

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from fathom.datasets import ImuNoise, Log, Trajectory
 from fathom.datasets.mounting import MountingSpec
+from fathom.datasets.simulated.faults import ImuFaults
 from fathom.datasets.simulated.imu import simulate_biases, simulate_white_noise
 from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.missions import fly
@@ -293,10 +294,10 @@ def test_gauss_markov_biases_with_a_long_memory_walk():
 
 
 def test_the_logs_truth_holds_the_gauss_markov_biases():
-    log = simulate(Scenario(duration_s=30, imu=ImuSpec(STILL, bias_correlation_s=5.0)), 3)
+    log = simulate(Scenario(duration_s=30, imu=ImuSpec(STILL, faults=ImuFaults(bias_correlation_s=5.0))), 3)
     expected = simulate_biases(STILL, np.arange(3001) * 10_000_000, random_stream("lawnmower", "imu_bias", 3), 5.0)
     assert np.array_equal(np.hstack([log.truth.b_a, log.truth.b_g]), expected)
-    assert "imu biases: Gauss–Markov, correlated over 5 s." in log.notes
+    assert "imu faults: bias_correlation_s 5." in log.notes
 
 
 def test_better_grades_are_better():
