@@ -81,13 +81,14 @@ def floors(
     The twin has the same path and readings at the same times, and its IMU reports the path itself.
 
     Args:
-        scenario, seed: as for `simulate`. Where `noise_scale` is not 1, the floor is of the noise that there is.
+        scenario, seed: as for `simulate`. Where `noise_scale` is not 1 or other noise is told, the floor is of the
+            noise that there is; what waves do to a pressure sensor counts as the white noise that is told of it.
         ticks_ns, lookahead_s, factors, max_gap_s: as for `floors_along`.
 
     Raises:
         ScoreError: a look-ahead is negative or no number.
     """
-    twin = simulate(replace(scenario, noise_scale=0.0), seed)
+    twin = simulate(replace(scenario.truly_told, noise_scale=0.0), seed)
     found = floors_along(twin, ticks_ns, lookahead_s, factors, max_gap_s)
     return {ahead: replace(floor, P=scenario.noise_scale**2 * floor.P) for ahead, floor in found.items()}
 

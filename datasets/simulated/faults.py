@@ -1,7 +1,7 @@
-"""Faults of simulated sensors, unknown to estimators.
+"""Faults of simulated sensors: all that a sensor does and its log never tells.
 
-Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig. They keep
-their size when a scenario scales its noise.
+Each is off by default and draws from a random stream of its own. Faults change the readings, never the rig nor a stated
+sigma. They keep their size when a scenario scales its noise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from ..quantities import DEGREE, STRICT, Finite, NotNegative, Number, Positive, Probability, Vector
 from ..rig import Mounting
 from ..state import Array, TimeArray
-from .random_streams import random_stream
 
 LONGEST_CLOCK_OFFSET_S = 5.0
 """Largest clock offset, s: well inside the margin of a mission's splines beyond both its ends."""
@@ -134,11 +133,17 @@ class HeadingFaults(Faults):
     """Of a heading sensor.
 
     Attributes:
+        bias_deg: added to every heading.
+        soft_iron_deg, soft_iron_axis_deg: it adds soft_iron_deg · sin 2(ψ − soft_iron_axis_deg), the quadrantal
+            deviation of a compass.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
         quantum_deg: its resolution.
     """
 
     outlier_deg: NotNegative = 45.0
+    bias_deg: Finite = 0.0
+    soft_iron_deg: NotNegative = 0.0
+    soft_iron_axis_deg: Finite = 0.0
     misalignment_deg: Vector = (0.0, 0.0, 0.0)
     quantum_deg: NotNegative = 0.0
 
@@ -153,6 +158,8 @@ class ImuFaults(Faults):
     """Of an IMU; a reading is one sample of its gyro and its accelerometer.
 
     Attributes:
+        bias_correlation_s: of biases that are first-order Gauss–Markov processes, where the rig says that they walk;
+            None: they do walk.
         gyro_scale, accel_scale: of what each axis reads to the truth, before bias and noise.
         misalignment_deg: roll, pitch and yaw of its true axes in those that the rig says.
         lever_arm_error_m: where it really is, less where the rig says, in B.
@@ -160,6 +167,7 @@ class ImuFaults(Faults):
         gyro_quantum_deg_s, accel_quantum_m_s2: to the nearest multiple of which a sample is rounded.
     """
 
+    bias_correlation_s: Positive | None = None
     gyro_outlier_deg_s: NotNegative = 20.0
     accel_outlier_m_s2: NotNegative = 5.0
     gyro_scale: Vector = (1.0, 1.0, 1.0)
@@ -207,11 +215,10 @@ def true_mounting(stated: Mounting, faults: AnyFaults) -> Mounting:
     return Mounting(R_BS, p_BS_B)
 
 
-def mar(z: Array, faults: AnyFaults, sensor: str, seed: int) -> Array:
+def mar(z: Array, faults: AnyFaults, rng: np.random.Generator) -> Array:
     """Return readings z (n, k) with outliers added, then clipped, then rounded."""
     outlier, limit, quantum = faults.marring
     if faults.outlier_probability:
-        rng = random_stream(seed, f"{sensor}_outliers")
         hit = rng.random(len(z)) < faults.outlier_probability
         z = z + hit[:, None] * outlier * rng.standard_normal(z.shape)
     if np.isfinite(limit).any():
@@ -222,20 +229,20 @@ def mar(z: Array, faults: AnyFaults, sensor: str, seed: int) -> Array:
     return z
 
 
-def arrives(t_ns: TimeArray, faults: AnyFaults, sensor: str, seed: int) -> NDArray[np.bool_]:
+def arrives(t_ns: TimeArray, faults: AnyFaults, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return which readings (n,) are neither dropped nor stamped in an outage; t_ns is from the log's start."""
     heard = np.ones(len(t_ns), bool)
     if faults.dropout_probability:
-        heard &= random_stream(seed, f"{sensor}_dropouts").random(len(t_ns)) >= faults.dropout_probability
+        heard &= rng.random(len(t_ns)) >= faults.dropout_probability
     for begin_s, end_s in faults.outages_s:
         heard &= ~((t_ns >= begin_s * 1e9) & (t_ns <= end_s * 1e9))
     return heard
 
 
-def repeated(heard: NDArray[np.bool_], faults: AnyFaults, sensor: str, seed: int) -> TimeArray:
+def repeated(heard: NDArray[np.bool_], faults: AnyFaults, rng: np.random.Generator) -> TimeArray:
     """Return, for each reading that is heard, the row (of all) whose values it carries: its own or an earlier one."""
     rows = np.flatnonzero(heard)
     if not (faults.repeat_probability and len(rows)):
         return rows
-    fresh = random_stream(seed, f"{sensor}_repeats").random(len(heard))[rows] >= faults.repeat_probability
+    fresh = rng.random(len(heard))[rows] >= faults.repeat_probability
     return rows[np.maximum.accumulate(np.where(fresh, np.arange(len(rows)), 0))]

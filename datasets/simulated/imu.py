@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -26,15 +27,16 @@ def sample_imu(scenario: Scenario, seed: int, motion: Motion, edges_ns: TimeArra
         biases: (n + 1, 6) of (f, w) at the edges; a sample carries that of its interval's beginning.
     """
     faults, noise = scenario.imu.faults, scenario.imu.figures
+    rng = partial(random_stream, scenario.mission, seed=seed)
     true_ns = edges_ns - round(faults.clock_offset_s * 1e9)
     signal = np.hstack(
         mean_imu(motion, scenario.mountings["imu"], scenario.gravity_m_s2, true_ns, scenario.earth_rate_rad_s)
     )
-    white = simulate_white_noise(noise, edges_ns, seed) * scenario.noise_scale
-    samples = mar(signal * faults.scale + biases[:-1] + white, faults, "imu", seed)
+    white = simulate_white_noise(noise, edges_ns, rng("imu_noise")) * scenario.noise_scale
+    samples = mar(signal * faults.scale + biases[:-1] + white, faults, rng("imu_outliers"))
     t_ns = edges_ns[1:]
-    heard = arrives(t_ns, faults, "imu", seed)
-    rows = repeated(heard, faults, "imu", seed)
+    heard = arrives(t_ns, faults, rng("imu_dropouts"))
+    rows = repeated(heard, faults, rng("imu_repeats"))
     return ImuStream(scenario.start_ns + t_ns[heard], samples[rows, 3:], samples[rows, :3])
 
 
@@ -90,13 +92,15 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
-def simulate_biases(noise: ImuNoise, edges_ns: TimeArray, seed: int, correlation_s: float | None = None) -> Array:
+def simulate_biases(
+    noise: ImuNoise, edges_ns: TimeArray, rng: np.random.Generator, correlation_s: float | None = None
+) -> Array:
     """Return (b_a, b_g), (n + 1, 6), at the edges: a draw at turn-on, and what is added to it in run.
 
     In run the bias walks; or, with correlation_s = T, it is a first-order Gauss–Markov process that the same noise K
     drives, db = −b/T dt + K dW, which has a standard deviation of K √(T / 2) in the long run, and starts at zero.
     """
-    draws = random_stream(seed, "imu_bias").standard_normal((len(edges_ns), 6))
+    draws = rng.standard_normal((len(edges_ns), 6))
     draws[0] *= _six(noise.accel_bias_sigma, noise.gyro_bias_sigma)
     dt_s = np.diff(edges_ns) * 1e-9
     walk = _six(noise.accel_walk, noise.gyro_walk)
@@ -112,9 +116,9 @@ def simulate_biases(noise: ImuNoise, edges_ns: TimeArray, seed: int, correlation
     return biases
 
 
-def simulate_white_noise(noise: ImuNoise, edges_ns: TimeArray, seed: int) -> Array:
+def simulate_white_noise(noise: ImuNoise, edges_ns: TimeArray, rng: np.random.Generator) -> Array:
     """Return white noise of (f, w), (n, 6): the mean of a density over an interval dt has sigma = density / √dt."""
-    draws = random_stream(seed, "imu_noise").standard_normal((len(edges_ns) - 1, 6))
+    draws = rng.standard_normal((len(edges_ns) - 1, 6))
     return draws * _six(noise.accel_density, noise.gyro_density) / np.sqrt(np.diff(edges_ns) * 1e-9)[:, None]
 
 

@@ -13,7 +13,7 @@ from ..state import Array
 from .motion import Motion
 from .random_streams import random_stream
 from .scenario import Scenario
-from .specs import DvlSpec
+from .specs import DvlSpec, as_told
 
 
 def janus_beams(beam_angle_rad: float) -> Array:
@@ -29,8 +29,9 @@ def read_dvl(
     """Return v_WD_D (n, 3), NaN without bottom lock, its error (n, 3), and its sigma (n, 3).
 
     The velocity is the least-squares solution of its beams, and its sigma their figure of merit: the square roots of
-    the diagonal of σ² (AᵀA)⁻¹. Four beams give independent errors. Three give sigmas √2 larger, and errors that are
-    correlated by ±1/2 in pairs. A reading has no correlations, so its sigmas are right axis by axis only.
+    the diagonal of σ² (AᵀA)⁻¹, with the σ that is told. Four beams give independent errors. Three give sigmas √2
+    larger, and errors that are correlated by ±1/2 in pairs. A reading has no correlations, so its sigmas are right axis
+    by axis only.
     """
     R_WB, p_WB_W, v_WB_W = motion.pose(t_s)
     v_WD_B = np.einsum("nji,nj->ni", R_WB, v_WB_W)
@@ -39,8 +40,9 @@ def read_dvl(
     v_WD_D = spec.faults.scale * v_WD_B @ dvl.R_BS
 
     A = janus_beams(spec.beam_angle_deg * DEGREE)
-    beam_error = spec.beam_sigma_m_s * random_stream(seed, "dvl").standard_normal((len(t_s), 4))
-    error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, spec.beam_sigma_m_s), (len(t_s), 1))
+    beam_error = spec.beam_sigma_m_s * random_stream(scenario.mission, "dvl", seed).standard_normal((len(t_s), 4))
+    told_m_s = as_told(spec).beam_sigma_m_s
+    error, sigma = beam_error @ np.linalg.pinv(A).T, np.tile(figure_of_merit(A, told_m_s), (len(t_s), 1))
     if scenario.seabed is None and spec.max_tilt_deg is None and not spec.beam_loss_probability:
         return v_WD_D, error, sigma
 
@@ -48,7 +50,7 @@ def read_dvl(
     for lost in range(4):
         rows, others = ~locked[:, lost] & (locked.sum(axis=1) == 3), np.arange(4) != lost
         error[rows] = beam_error[rows][:, others] @ np.linalg.inv(A[others]).T
-        sigma[rows] = figure_of_merit(A[others], spec.beam_sigma_m_s)
+        sigma[rows] = figure_of_merit(A[others], told_m_s)
     enough = locked.sum(axis=1) >= (3 if spec.three_beams else 4)
     return np.where(enough[:, None], v_WD_D, np.nan), error, sigma
 
@@ -68,5 +70,7 @@ def bottom_lock(scenario: Scenario, spec: DvlSpec, R_WD: Array, p_WD_W: Array, s
         range_m = scenario.seabed.ranges(p_WD_W, beams_W)
         locked &= (range_m >= spec.min_range_m) & (range_m <= spec.max_range_m)
     if spec.beam_loss_probability:
-        locked &= random_stream(seed, "dvl_beams").random((len(R_WD), 4)) >= spec.beam_loss_probability
+        locked &= (
+            random_stream(scenario.mission, "dvl_beams", seed).random((len(R_WD), 4)) >= spec.beam_loss_probability
+        )
     return locked

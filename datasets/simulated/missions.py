@@ -47,7 +47,7 @@ def fly(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Motion
         return follow(scenario, path)
     if path is not None:
         raise DatasetError(f"simulate: mission {scenario.mission} takes no path; only mission {RECORDED!r} follows one")
-    return draw(scenario, random_stream(seed, "mission"), Sea.of(scenario, seed))
+    return draw(scenario, random_stream(scenario.mission, "mission", seed), Sea.of(scenario, seed))
 
 
 def draw(scenario: Scenario, rng: np.random.Generator, sea: Sea | None = None) -> Motion:

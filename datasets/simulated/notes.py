@@ -8,17 +8,16 @@ from typing import Any
 from .scenario import Scenario
 from .specs import SENSORS
 
-TOLD = {
+UNSEEN = {
     *("min_range_m", "max_range_m", "max_tilt_deg", "beam_loss_probability", "three_beams"),
-    *("reacquisition_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg"),
-    *("velocity_in", "wrong_by_deg"),
+    *("reacquisition_s", "velocity_in", "wrong_by_deg"),
 }
 """Settings of sensors and of the prior that neither the rig nor the readings nor the prior show."""
 
 
 def scenario_notes(scenario: Scenario) -> list[str]:
     """Return sentences on the world, and on each sensor's settings, delays and faults, where there are any."""
-    parts = (_world, _mountings, _biases, _sensors, _late, _faults, _prior)
+    parts = (_world, _mountings, _sensors, _late, _faults, _told, _prior)
     return [note for part in parts for note in part(scenario)]
 
 
@@ -35,14 +34,11 @@ def _mountings(scenario: Scenario) -> list[str]:
     return [note for sensor, spec in aboard.items() if spec is not None for note in spec.notes(sensor)]
 
 
-def _biases(scenario: Scenario) -> list[str]:
-    correlation_s = scenario.imu.bias_correlation_s
-    return [] if correlation_s is None else [f"imu biases: Gauss–Markov, correlated over {correlation_s:g} s."]
-
-
 def _sensors(scenario: Scenario) -> list[str]:
     specs = {sensor: getattr(scenario, sensor) for sensor in SENSORS}
-    dials = {s: {n: v for n, v in changed(spec).items() if n in TOLD} for s, spec in specs.items() if spec is not None}
+    dials = {
+        s: {n: v for n, v in changed(spec).items() if n in UNSEEN} for s, spec in specs.items() if spec is not None
+    }
     return [f"{sensor}: {listed(values)}." for sensor, values in dials.items() if values]
 
 
@@ -66,8 +62,14 @@ def _faults(scenario: Scenario) -> list[str]:
     return notes
 
 
+def _told(scenario: Scenario) -> list[str]:
+    parts = {name: getattr(scenario, name) for name in ("imu", *SENSORS, "prior")}
+    told = {name: changed(part.told) for name, part in parts.items() if part is not None}
+    return [f"{name} is told otherwise than simulated: {listed(dials)}." for name, dials in told.items() if dials]
+
+
 def _prior(scenario: Scenario) -> list[str]:
-    dials = {name: value for name, value in changed(scenario.prior).items() if name in TOLD}
+    dials = {name: value for name, value in changed(scenario.prior).items() if name in UNSEEN}
     return [f"prior: {listed(dials)}."] if dials else []
 
 

@@ -1,4 +1,4 @@
-"""Random streams: one for each cause of randomness."""
+"""Random streams: one for each mission, cause of randomness and seed."""
 
 from __future__ import annotations
 
@@ -38,6 +38,11 @@ RANDOM_STREAMS = {
 """Separate, so that dropping one changes no other. Never renumber: a seed would give another log."""
 
 
-def random_stream(seed: int, cause: str) -> np.random.Generator:
-    """Return the generator of one cause of randomness."""
-    return np.random.default_rng([seed, RANDOM_STREAMS[cause]])
+def random_stream(mission: str, cause: str, seed: int) -> np.random.Generator:
+    """Return the generator of one mission, one cause of randomness and one seed.
+
+    Two missions share nothing, so that one seed gives two experiments. The key cannot be ambiguous: of a name,
+    every word of 32 bits is larger than any cause, and a seed is one word or two at the end.
+    """
+    name = int.from_bytes(mission.encode("utf-8"), "little")
+    return np.random.default_rng([name, RANDOM_STREAMS[cause], seed])

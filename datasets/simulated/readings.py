@@ -1,9 +1,10 @@
-"""The simulated aiding sensors: each reads the exact motion through its mounting, with noise of the stated size."""
+"""The simulated aiding sensors: each reads the exact motion through its mounting, with noise of the simulated size."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from .motion import Motion
 from .random_streams import random_stream
 from .scenario import Scenario
 from .sea import Sea
-from .specs import DepthSpec, GpsSpec, HeadingSpec, SensorSpec
+from .specs import DepthSpec, GpsSpec, HeadingSpec, SensorSpec, as_told
 
 Kind = TypeVar("Kind", bound=ReadingStream)
 
@@ -44,39 +45,49 @@ def read(kind: type[Kind], scenario: Scenario, seed: int, motion: Motion) -> Kin
     if spec is None:
         return None
     sensor, faults = kind.name, spec.faults
+    rng = partial(random_stream, scenario.mission, seed=seed)
     t_ns = ticks(spec.rate_hz, scenario.duration_s)
     true_s = t_ns * 1e-9 - faults.clock_offset_s
     z, error, sigma = READ[kind](scenario, spec, scenario.mountings[sensor], motion, true_s, seed)
-    z = mar(z + scenario.noise_scale * error, faults, sensor, seed)
-    heard = np.isfinite(z).all(axis=1) & arrives(t_ns, faults, sensor, seed)
-    rows = repeated(heard, faults, sensor, seed)
+    z = mar(z + scenario.noise_scale * error, faults, rng(f"{sensor}_outliers"))
+    heard = np.isfinite(z).all(axis=1) & arrives(t_ns, faults, rng(f"{sensor}_dropouts"))
+    rows = repeated(heard, faults, rng(f"{sensor}_repeats"))
     t_ns, z = scenario.start_ns + t_ns[heard], z[rows]
     if kind is HeadingStream:
         z = np.arctan2(np.sin(z), np.cos(z))
-    return kind(t_ns, t_ns + _delays(spec, sensor, heard, seed), z, np.broadcast_to(sigma, error.shape)[rows])
+    return kind(
+        t_ns, t_ns + _delays(spec, heard, rng(f"{sensor}_disorder")), z, np.broadcast_to(sigma, error.shape)[rows]
+    )
 
 
-def _delays(spec: SensorSpec, sensor: str, heard: NDArray[np.bool_], seed: int) -> TimeArray:
+def _delays(spec: SensorSpec, heard: NDArray[np.bool_], rng: np.random.Generator) -> TimeArray:
     """Return how long each reading that is heard is on its way, ns: delay_s, and uniformly up to disorder_s more.
 
     It is counted from the stamp: a clock that is ahead makes the way look shorter, down to none.
     """
-    more_s = spec.disorder_s * random_stream(seed, f"{sensor}_disorder").random(len(heard))
+    more_s = spec.disorder_s * rng.random(len(heard))
     way_s = np.maximum(spec.delay_s + more_s[heard] - spec.faults.clock_offset_s, 0.0)
     return np.rint(way_s * 1e9).astype(np.int64)
 
 
 # Each reader returns what the sensor would say without noise (n, k), NaN where it hears nothing, its error (n, k), and
-# its sigma, (k,) or (n, k).
+# the sigma that it tells, (k,) or (n, k).
 
 
 def _read_depth(
     scenario: Scenario, spec: DepthSpec, depth: Mounting, motion: Motion, t_s: Array, seed: int
 ) -> tuple[Array, Array, Array]:
     p_WP_W, sea = _point(motion, depth, t_s), Sea.of(scenario, seed)
-    depth_m = -p_WP_W[:, 2:] if sea is None else sea.rise_m(t_s, p_WP_W)[:, None] - p_WP_W[:, 2:]
-    sigma = np.array([spec.sigma_m])
-    return -spec.faults.scale * depth_m, sigma * random_stream(seed, "depth").standard_normal((len(t_s), 1)), sigma
+    z_m, told = p_WP_W[:, 2], np.array([as_told(spec).sigma_m])
+    if sea is not None:
+        z_m = z_m - sea.rise_m(t_s, p_WP_W)
+    error = spec.sigma_m * random_stream(scenario.mission, "depth", seed).standard_normal((len(t_s), 1))
+    if sea is not None and scenario.waves is not None and scenario.waves.told and spec.told.sigma_m is None:
+        told = np.hypot(spec.sigma_m, sea.swell_sigma_m(z_m, 1 / spec.rate_hz))[:, None]
+    z_m = spec.faults.scale * z_m
+    if sea is not None and scenario.tide is not None and scenario.tide.told:
+        z_m = z_m + sea.tide_m(t_s)
+    return z_m[:, None], error, told
 
 
 def _read_gps(
@@ -88,9 +99,12 @@ def _read_gps(
         watch_s = np.arange(*scenario.reach_s, WATCH_S)
         awash_s = np.concatenate([[-np.inf], watch_s[~_afloat(scenario, gps, motion, watch_s, seed)]])
         heard &= t_s - awash_s[np.searchsorted(awash_s, t_s, side="right") - 1] >= spec.reacquisition_s
-    sigma = np.array([spec.horizontal_sigma_m, spec.horizontal_sigma_m, spec.vertical_sigma_m])
-    error = sigma * random_stream(seed, "gps").standard_normal((len(t_s), 3))
-    return np.where(heard[:, None], p_WG_W, np.nan), error, sigma
+    sigma, told = (
+        np.array([each.horizontal_sigma_m, each.horizontal_sigma_m, each.vertical_sigma_m])
+        for each in (spec, as_told(spec))
+    )
+    error = sigma * random_stream(scenario.mission, "gps", seed).standard_normal((len(t_s), 3))
+    return np.where(heard[:, None], p_WG_W, np.nan), error, told
 
 
 def _afloat(scenario: Scenario, gps: Mounting, motion: Motion, t_s: Array, seed: int) -> NDArray[np.bool_]:
@@ -103,14 +117,14 @@ def _afloat(scenario: Scenario, gps: Mounting, motion: Motion, t_s: Array, seed:
 def _read_heading(
     scenario: Scenario, spec: HeadingSpec, heading: Mounting, motion: Motion, t_s: Array, seed: int
 ) -> tuple[Array, Array, Array]:
-    R_WB, _, _ = motion.pose(t_s)
+    (R_WB, _, _), faults = motion.pose(t_s), spec.faults
     x_H_W = R_WB @ heading.R_BS[:, 0]
     psi = np.arctan2(x_H_W[:, 1:2], x_H_W[:, :1])
-    if spec.soft_iron_deg:
-        psi += spec.soft_iron_deg * DEGREE * np.sin(2 * (psi - spec.soft_iron_axis_deg * DEGREE))
-    psi += spec.bias_deg * DEGREE
-    sigma = np.array([spec.sigma_deg * DEGREE])
-    return psi, sigma * random_stream(seed, "heading").standard_normal((len(t_s), 1)), sigma
+    if faults.soft_iron_deg:
+        psi += faults.soft_iron_deg * DEGREE * np.sin(2 * (psi - faults.soft_iron_axis_deg * DEGREE))
+    psi += faults.bias_deg * DEGREE
+    error = spec.sigma_deg * DEGREE * random_stream(scenario.mission, "heading", seed).standard_normal((len(t_s), 1))
+    return psi, error, np.array([as_told(spec).sigma_deg * DEGREE])
 
 
 def _point(motion: Motion, mounting: Mounting, t_s: Array) -> Array:

@@ -32,6 +32,7 @@ from .specs import (
     PriorSpec,
     TideSpec,
     WavesSpec,
+    as_told,
 )
 
 MOST_READINGS = 10_000_000
@@ -51,7 +52,12 @@ CALLED_NOW = {
     **{f"{dial}_mps": f"{dial}_m_s" for dial in ("outlier", "limit", "quantum")},
     **{f"accel_{dial}_mps2": f"accel_{dial}_m_s2" for dial in ("outlier", "limit", "quantum")},
     **{f"gyro_{dial}_dps": f"gyro_{dial}_deg_s" for dial in ("outlier", "limit", "quantum")},
-    **{f"imu_{name}": f"imu.{name}" for name in ("rate_hz", "bias_correlation_s", "faults")},
+    **{f"imu_{name}": f"imu.{name}" for name in ("rate_hz", "faults")},
+    "imu_bias_correlation_s": "imu.faults.bias_correlation_s",
+    **{
+        f"{name}": f"faults.{name}"
+        for name in ("bias_correlation_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg")
+    },
     **{f"{sensor}_mounting": f"{sensor}.mounting" for sensor in ("imu", "depth", "gps", "heading")},
     **{name: f"noise.{name}" for name in ImuNoise.__dataclass_fields__},
     "roll_pitch_yaw_deg": "roll_deg, pitch_deg and yaw_deg",
@@ -197,6 +203,19 @@ class Scenario:
         return dataclasses.asdict(self)
 
     @property
+    def truly_told(self) -> Scenario:
+        """The same scenario, whose log states the noise that is simulated."""
+        parts = {name: getattr(self, name) for name in ("imu", *SENSORS, "prior")}
+        return dataclasses.replace(
+            self,
+            **{
+                name: dataclasses.replace(part, told=type(part.told)())
+                for name, part in parts.items()
+                if part is not None
+            },
+        )
+
+    @property
     def faults(self) -> dict[str, AnyFaults]:
         """The faults of the IMU and of every aiding sensor aboard, by sensor name."""
         aboard = {sensor: getattr(self, sensor) for sensor in SENSORS}
@@ -218,7 +237,7 @@ class Scenario:
         """The rig that estimators get."""
         aboard = {sensor: getattr(self, sensor) for sensor in ("depth", "gps", "heading")}
         return Rig(
-            imu_noise=self.imu.figures,
+            imu_noise=as_told(self.imu).figures,
             imu=self.imu.mounting.mounting(),
             **{sensor: spec.mounting.mounting() for sensor, spec in aboard.items() if spec is not None},
             gravity=self.gravity_m_s2,

@@ -25,6 +25,11 @@ COMPONENTS = 16
 """Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
 
 
+SLOWEST_MEAN = 1.4492
+"""Largest value of 2 sin²x / x, at tan x = 2x. The mean of a wave over a window τ has (sin x / x)² of its variance,
+with x = ω τ / 2, and the mean of white readings every Δt has Δt / τ. At most the wave's is larger by this over ω Δt."""
+
+
 @dataclass(frozen=True, eq=False)
 class Sea:
     """Waves and tide.
@@ -56,7 +61,7 @@ class Sea:
         share = (np.arange(COMPONENTS) + 0.5) / COMPONENTS
         frequency = 2 * math.pi / waves.period_s * (-0.8 * np.log(share)) ** -0.25
         amplitude = np.full(COMPONENTS, waves.height_m / 4 * math.sqrt(2 / COMPONENTS))
-        phase = random_stream(seed, "waves").uniform(0, 2 * math.pi, COMPONENTS)
+        phase = random_stream(scenario.mission, "waves", seed).uniform(0, 2 * math.pi, COMPONENTS)
         towards = waves.towards_deg * DEGREE
         direction = np.array([math.cos(towards), math.sin(towards)])
         return cls(amplitude, frequency, phase, direction, gravity, scenario.tide)
@@ -87,6 +92,18 @@ class Sea:
         phase = self.tide.phase_deg * DEGREE
         turned = 2 * math.pi / (3600 * self.tide.period_h) * t_s
         return self.tide.amplitude_m * (np.sin(turned + phase) - math.sin(phase))
+
+    def swell_sigma_m(self, z_m: Array, period_s: float) -> Array:
+        """Return the standard deviation to be told for what waves do to a pressure sensor at heights z_m, (n,) m.
+
+        White noise of this sigma, in readings every period_s, has a mean over any window that errs by no less than the
+        mean of rise_m: docs/conventions.md (69). For a single reading it is no less than the rms of rise_m. Readings
+        must come three times in a wave's period or more often, or waves look slower than they are.
+        """
+        k = self.frequency_rad_s**2 / self.gravity
+        repeated = np.maximum(1.0, SLOWEST_MEAN / (self.frequency_rad_s * period_s))
+        variance = 0.5 * self.amplitude_m**2 * repeated
+        return np.sqrt(np.exp(np.outer(np.minimum(z_m, 0.0), 2 * k)) @ variance)
 
     def _waves(self, t_s: Array, p_W: Array) -> tuple[Array, Array, Array]:
         """Return a e^kz and k · x − ω t + φ, (n, m), and k (m,)."""

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import DatasetError
 from ..log import DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..quantities import DEGREE
-from ..state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Belief
+from ..state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, Belief
 from ..trajectory import Trajectory
 from .imu import sample_imu, simulate_biases
 from .missions import fly
@@ -17,6 +17,7 @@ from .notes import scenario_notes
 from .random_streams import random_stream
 from .readings import read, ticks
 from .scenario import Scenario
+from .specs import ImuSpec, PriorSpec, as_told
 
 
 def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> Log:
@@ -24,7 +25,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
 
     Args:
         scenario: what to simulate.
-        seed: of every random stream.
+        seed: of every random stream of this mission; another mission has others.
         path: what the mission "recorded" follows, in place of the scenario's file.
 
     Raises:
@@ -34,7 +35,9 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
         raise DatasetError("simulate: seed must be from 0 to 2^63 − 1")
     motion, rig, start_ns = fly(scenario, seed, path), scenario.rig, scenario.start_ns
     edges_ns = np.concatenate([[0], ticks(scenario.imu.rate_hz, scenario.duration_s)])
-    biases = simulate_biases(rig.imu_noise, edges_ns, seed, scenario.imu.bias_correlation_s) * scenario.noise_scale
+    rng = random_stream(scenario.mission, "imu_bias", seed)
+    biases = simulate_biases(scenario.imu.figures, edges_ns, rng, scenario.imu.faults.bias_correlation_s)
+    biases *= scenario.noise_scale
 
     R_WB, p_WB_W, v_WB_W = motion.pose(edges_ns * 1e-9)
     truth = Trajectory(start_ns + edges_ns, R_WB, p_WB_W, v_WB_W, b_a=biases[:, :3], b_g=biases[:, 3:])
@@ -61,7 +64,7 @@ def simulate(scenario: Scenario, seed: int, path: Trajectory | None = None) -> L
 
 
 def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
-    """Return the belief at the start: its mean is the truth less one draw of the error that its P states.
+    """Return the belief at the start: its mean is the truth less one draw of the error.
 
     The draw xi is made in the coordinates in which the sigmas are independent. With C the axes of the attitude's (W
     where a heading has its own, else B), and u the velocity in B where it is known there:
@@ -71,29 +74,36 @@ def draw_prior(scenario: Scenario, truth: Trajectory, seed: int) -> Belief:
 
     The biases' means are zero: their errors were drawn at turn-on.
     """
-    noise, prior = scenario.imu.figures, scenario.prior
-    sigma = np.empty(DIM)
-    sigma[THETA] = prior.attitude_deg * DEGREE
-    sigma[POSITION] = prior.position_m
-    sigma[VELOCITY] = prior.velocity_m_s
-    sigma[ACCEL_BIAS] = noise.accel_bias_sigma
-    sigma[GYRO_BIAS] = noise.gyro_bias_sigma
-    if prior.heading_deg is not None:
-        sigma[THETA] = np.array([prior.attitude_deg, prior.attitude_deg, prior.heading_deg]) * DEGREE
-    state, random = truth.state(0), random_stream(seed, "prior")
-    error = random.standard_normal(DIM) * sigma * scenario.noise_scale
-    if prior.wrong_by_deg is not None:
+    spec, state = scenario.prior, truth.state(0)
+    random = random_stream(scenario.mission, "prior", seed)
+    error = random.standard_normal(DIM) * prior_sigma(scenario.imu, spec) * scenario.noise_scale
+    if spec.wrong_by_deg is not None:
         axis = random.standard_normal(3)
-        error[THETA] = prior.wrong_by_deg * DEGREE * axis / np.linalg.norm(axis)
-    if prior.heading_deg is not None:
+        error[THETA] = spec.wrong_by_deg * DEGREE * axis / np.linalg.norm(axis)
+    told = as_told(spec)
+    if told.heading_deg is not None:
         error[THETA] = state.R_WB.T @ error[THETA]
     error[ACCEL_BIAS], error[GYRO_BIAS] = state.b_a, state.b_g
     mean, to_error = state.retract(-error), np.eye(DIM)
-    if prior.heading_deg is not None:
+    if told.heading_deg is not None:
         to_error[THETA, THETA] = mean.R_WB.T
-    if prior.velocity_in == "B":
+    if spec.velocity_in == "B":
         u_WB_B = state.R_WB.T @ state.v_WB_W - error[VELOCITY]
         mean = replace(mean, v_WB_W=mean.R_WB @ u_WB_B)
         to_error[VELOCITY, THETA] = mean.R_WB @ np.cross(to_error[THETA, THETA].T, u_WB_B).T
         to_error[VELOCITY, VELOCITY] = mean.R_WB
+    sigma = prior_sigma(as_told(scenario.imu), told)
     return Belief(int(truth.t_ns[0]), mean, to_error @ np.diag(sigma**2) @ to_error.T)
+
+
+def prior_sigma(imu: ImuSpec, prior: PriorSpec) -> Array:
+    """Return the standard deviations of the error at the start, (15,), in the coordinates of its draw."""
+    sigma = np.empty(DIM)
+    sigma[THETA] = prior.attitude_deg * DEGREE
+    if prior.heading_deg is not None:
+        sigma[THETA.stop - 1] = prior.heading_deg * DEGREE
+    sigma[POSITION] = prior.position_m
+    sigma[VELOCITY] = prior.velocity_m_s
+    sigma[ACCEL_BIAS] = imu.figures.accel_bias_sigma
+    sigma[GYRO_BIAS] = imu.figures.gyro_bias_sigma
+    return sigma

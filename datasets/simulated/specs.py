@@ -1,12 +1,16 @@
-"""The parts of a scenario, as a file states them: missions, sea, sensors and the prior, each validated."""
+"""The parts of a scenario, as a file states them: missions, sea, sensors and the prior, each validated.
+
+A spec's own dials of noise are both simulated and told: the log's rig, readings and prior state them. What stands under
+`faults` is simulated and never told. What stands under `told` is told in place of the dial of that name.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 from pydantic.dataclasses import dataclass
 
 from ..errors import nearest
@@ -54,8 +58,13 @@ RECORDED = "recorded"
 
 @dataclass(frozen=True, config=STRICT)
 class WavesSpec:
-    """A sea state: significant height, period of the spectrum's peak, and where the waves run (from east, to north)."""
+    """A sea state: significant height, period of the spectrum's peak, and where the waves run (from east, to north).
 
+    Attributes:
+        told: whether the depth sensor's sigma has in it what the waves do to its readings.
+    """
+
+    told: bool = True
     height_m: Positive = 0.5
     period_s: Annotated[Number, Field(ge=4, le=30)] = 6.0
     towards_deg: Finite = 0.0
@@ -73,18 +82,82 @@ class WavesSpec:
 
 @dataclass(frozen=True, config=STRICT)
 class TideSpec:
-    """A rise and fall of the water, from z = 0 at the log's start; its phase there is 0 where it rises fastest."""
+    """A rise and fall of the water, from z = 0 at the log's start; its phase there is 0 where it rises fastest.
 
+    Attributes:
+        told: whether the depth sensor's readings are corrected for it, as from a table of tides.
+    """
+
+    told: bool = False
     amplitude_m: Annotated[Positive, Field(le=10)] = 1.0
     period_h: Annotated[Positive, Field(ge=0.1)] = 12.42
     phase_deg: Finite = 0.0
 
 
 Delay = Annotated[NotNegative, Field(le=LONGEST_S)]
+
+
+def _known_noise(noise: str | ImuNoise) -> str | ImuNoise:
+    if isinstance(noise, str) and noise not in IMU_GRADES:
+        raise ValueError(f"no IMU grade {noise!r}{nearest(noise, IMU_GRADES)}; known: {', '.join(IMU_GRADES)}")
+    if isinstance(noise, ImuNoise):
+        for name, value in dataclasses.asdict(noise).items():
+            if not (math.isfinite(value) and (value > 0 or (value == 0 and name.endswith("walk")))):
+                raise ValueError(f"{name} must be positive and finite, found {value}")
+    return noise
+
+
 Noise = Annotated[
     Annotated[str, Tag("grade")] | Annotated[ImuNoise, Tag("figures")],
     Discriminator(lambda noise: "grade" if isinstance(noise, str) else "figures"),
+    AfterValidator(_known_noise),
 ]
+
+
+@dataclass(frozen=True, config=STRICT)
+class ImuTold:
+    """What the rig states of the IMU's noise."""
+
+    noise: Noise | None = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class DvlTold:
+    """What the DVL's sigmas are made from."""
+
+    beam_sigma_m_s: Positive | None = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class DepthTold:
+    """The depth sensor's sigma, waves or not."""
+
+    sigma_m: Positive | None = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class GpsTold:
+    """The fixes' sigmas."""
+
+    horizontal_sigma_m: Positive | None = None
+    vertical_sigma_m: Positive | None = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class HeadingTold:
+    """The headings' sigma."""
+
+    sigma_deg: Positive | None = None
+
+
+@dataclass(frozen=True, config=STRICT)
+class PriorTold:
+    """The sigmas in the prior's covariance."""
+
+    attitude_deg: Positive | None = None
+    heading_deg: Annotated[Positive, Field(le=180)] | None = None
+    position_m: Positive | None = None
+    velocity_m_s: Positive | None = None
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -93,25 +166,13 @@ class ImuSpec:
 
     Attributes:
         noise: a name in IMU_GRADES, or figures of one's own.
-        bias_correlation_s: of Gauss–Markov biases; None: they walk.
     """
 
     noise: Noise = "tactical"
     rate_hz: Positive = 100.0
-    bias_correlation_s: Positive | None = None
     mounting: MountingSpec = MountingSpec((-0.35, 0.05, 0.12), roll_deg=180.0, pitch_deg=2.0, yaw_deg=87.0)
+    told: ImuTold = ImuTold()
     faults: ImuFaults = ImuFaults()
-
-    @field_validator("noise")
-    @classmethod
-    def _known_grade(cls, noise: str | ImuNoise) -> str | ImuNoise:
-        if isinstance(noise, str) and noise not in IMU_GRADES:
-            raise ValueError(f"no IMU grade {noise!r}{nearest(noise, IMU_GRADES)}; known: {', '.join(IMU_GRADES)}")
-        if isinstance(noise, ImuNoise):
-            for name, value in dataclasses.asdict(noise).items():
-                if not (math.isfinite(value) and (value > 0 or (value == 0 and name.endswith("walk")))):
-                    raise ValueError(f"{name} must be positive and finite, found {value}")
-        return noise
 
     @property
     def figures(self) -> ImuNoise:
@@ -133,18 +194,20 @@ class DvlSpec:
     three_beams: bool = True  # whether three beams are enough for a reading
     delay_s: Delay = 0.0
     disorder_s: Delay = 0.0
+    told: DvlTold = DvlTold()
     faults: DvlFaults = DvlFaults()
 
 
 @dataclass(frozen=True, config=STRICT)
 class DepthSpec:
-    """Pressure sensor. The Bar30 resolves 2 mm; sigma covers swell and air pressure as well."""
+    """Pressure sensor. The Bar30 resolves 2 mm; sigma covers air pressure as well, and is told with waves in it."""
 
     rate_hz: Positive = 10.0
     sigma_m: Positive = 0.02
     delay_s: Delay = 0.0
     disorder_s: Delay = 0.0
     mounting: MountingSpec = MountingSpec((0.40, -0.06, 0.05))
+    told: DepthTold = DepthTold()
     faults: DepthFaults = DepthFaults()
 
 
@@ -159,24 +222,20 @@ class GpsSpec:
     delay_s: Delay = 0.0
     disorder_s: Delay = 0.0
     mounting: MountingSpec = MountingSpec((-0.25, 0.0, 0.30))
+    told: GpsTold = GpsTold()
     faults: GpsFaults = GpsFaults()
 
 
 @dataclass(frozen=True, config=STRICT)
 class HeadingSpec:
-    """Magnetic heading, 1–2° after calibration. Its bias and soft iron are unknown to estimators.
-
-    Soft iron adds soft_iron_deg · sin 2(ψ − soft_iron_axis_deg): the quadrantal deviation of a compass.
-    """
+    """Magnetic heading, 1–2° after calibration."""
 
     rate_hz: Positive = 5.0
     sigma_deg: Positive = 1.0
-    bias_deg: Finite = 0.0
-    soft_iron_deg: NotNegative = 0.0
-    soft_iron_axis_deg: Finite = 0.0
     delay_s: Delay = 0.0
     disorder_s: Delay = 0.0
     mounting: MountingSpec = MountingSpec((0.55, 0.0, 0.05), roll_deg=1.5, pitch_deg=-2.0, yaw_deg=4.0)
+    told: HeadingTold = HeadingTold()
     faults: HeadingFaults = HeadingFaults()
 
 
@@ -205,3 +264,13 @@ class PriorSpec:
     velocity_m_s: Positive = 0.05
     velocity_in: Literal["W", "B"] = "W"
     wrong_by_deg: Annotated[NotNegative, Field(le=180)] | None = None
+    told: PriorTold = PriorTold()
+
+
+Spec = TypeVar("Spec", ImuSpec, DvlSpec, DepthSpec, GpsSpec, HeadingSpec, PriorSpec)
+
+
+def as_told(spec: Spec) -> Spec:
+    """Return a spec whose noise is what the log states of it."""
+    told = {name: value for name, value in vars(spec.told).items() if value is not None}
+    return dataclasses.replace(spec, **told)

@@ -71,9 +71,13 @@ def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str)
         {"mission": "yo-yo", "imu": "industrial"},
         {"mission": "helix", "imu": "tactical"},
         {"mission": "box", "imu": "navigation"},
-        {"mission": "transit", "imu": "navigation", "waves": {"height_m": 0.5}},
+        {"mission": "transit", "imu": "navigation", "waves": {"height_m": 0.5, "told": False}},
         {"mission": "helix", "speed_m_s": 3.0, "turn_radius_m": 8.0, "imu": "navigation", "duration_s": 300},
-        {"latitude_deg": 60.0, "imu": {"rate_hz": 50.0, "bias_correlation_s": 100.0}, "tide": {"amplitude_m": 1.0}},
+        {
+            "latitude_deg": 60.0,
+            "imu": {"rate_hz": 50.0, "faults": {"bias_correlation_s": 100.0}},
+            "tide": {"amplitude_m": 1.0},
+        },
         {"dvl": {"rate_hz": 25.0}, "depth": {"rate_hz": 50.0}, "heading": {"rate_hz": 50.0}},
         {"dvl": {"rate_hz": 1.0}, "depth": {"rate_hz": 1.0}, "heading": {"rate_hz": 1.0}},
     ],
@@ -82,6 +86,12 @@ def said(findings: list[Finding] | tuple[Finding, ...], stream: str, words: str)
 def test_nothing_looks_wrong_in_a_clean_log(keys: dict[str, Any], seed: int) -> None:
     inspection = inspect_log(simulated(seed, **keys))
     assert [finding.message for finding in inspection.findings] == []
+
+
+def test_a_depth_sensor_that_is_told_of_waves_is_said_to_be_right_only_if_its_error_is_slow() -> None:
+    (finding,) = inspect_log(simulated(mission="transit", waves={"height_m": 0.5})).findings
+    assert "depth scatters from reading to reading by 0.02" in finding.message
+    assert "only if most of the error is slow" in finding.message
 
 
 def test_nothing_looks_wrong_in_a_full_attitude() -> None:

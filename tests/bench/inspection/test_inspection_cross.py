@@ -158,7 +158,12 @@ PLANTED: dict[str, tuple[dict[str, Any], str, str, float]] = {
     "dvl late": ({"dvl": LATE}, "dvl", CLOCK.format("dvl"), 0.4),
     "imu late": ({"imu": {"noise": "industrial", "faults": {"clock_offset_s": 0.4}}}, "imu", CLOCK.format("dvl"), -0.4),
     "dvl scale": ({"dvl": {"faults": {"scale": 1.03}}}, "dvl", f"{PATH}: scale that the DVL needs", 1 / 1.03),
-    "heading offset": ({"heading": {"bias_deg": -5}}, "heading", "heading against truth: heading less truth", -5.0),
+    "heading offset": (
+        {"heading": {"faults": {"bias_deg": -5}}},
+        "heading",
+        "heading against truth: heading less truth",
+        -5.0,
+    ),
     "imu turned": (
         {"imu": {"noise": "industrial", "faults": {"misalignment_deg": [0, 0, 5]}}},  # about its own z, which is down
         "imu",

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from fathom.datasets import ImuNoise, Log, Trajectory
 from fathom.datasets.mounting import MountingSpec
+from fathom.datasets.simulated.faults import ImuFaults
 from fathom.datasets.simulated.imu import simulate_biases, simulate_white_noise
 from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.missions import fly
+from fathom.datasets.simulated.random_streams import random_stream
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import MISSIONS, ImuSpec, TideSpec, WavesSpec
@@ -178,7 +180,7 @@ def test_imu_noise_has_the_stated_densities(grade):
     """Means over 1 s have sigma = density, and single samples density / √dt: white in between."""
     noise = IMU_GRADES[grade]
     edges_ns = np.arange(0, 601) * 10_000_000
-    white = np.concatenate([simulate_white_noise(noise, edges_ns, seed) for seed in range(40)])
+    white = np.concatenate([simulate_white_noise(noise, edges_ns, np.random.default_rng(seed)) for seed in range(40)])
     for columns, density in ((slice(0, 3), noise.accel_density), (slice(3, 6), noise.gyro_density)):
         assert_variance(white[:, columns], density / np.sqrt(0.01))
         assert_variance(white[:, columns].reshape(-1, 100, 3).mean(axis=1), density)
@@ -188,7 +190,7 @@ def test_imu_noise_has_the_stated_densities(grade):
 def test_biases_start_and_walk_as_stated(grade):
     noise = IMU_GRADES[grade]
     edges_ns = np.arange(0, 101) * 10_000_000
-    b = np.stack([simulate_biases(noise, edges_ns, seed) for seed in range(300)])
+    b = np.stack([simulate_biases(noise, edges_ns, np.random.default_rng(seed)) for seed in range(300)])
     for columns, sigma, walk in (
         (slice(0, 3), noise.accel_bias_sigma, noise.accel_walk),
         (slice(3, 6), noise.gyro_bias_sigma, noise.gyro_walk),
@@ -246,7 +248,9 @@ def test_allan_deviation_recovers_density_and_walk(sensor, tau_s):
     edges_ns = np.arange(6001) * 100_000_000
 
     def of_seed(seed):
-        noise = simulate_biases(STILL, edges_ns, seed)[:-1] + simulate_white_noise(STILL, edges_ns, seed)
+        noise = simulate_biases(STILL, edges_ns, np.random.default_rng(seed))[:-1] + simulate_white_noise(
+            STILL, edges_ns, np.random.default_rng([1, seed])
+        )
         return allan_variance(noise[:, AXES[sensor]], 10 * tau_s)
 
     assert_allan(of_seed, density**2 / tau_s + walk**2 * tau_s / 3)
@@ -261,15 +265,17 @@ def test_allan_deviation_recovers_gauss_markov_biases(tau_s):
     expected *= 1 - T / (2 * tau_s) * (3 - 4 * np.exp(-tau_s / T) + np.exp(-2 * tau_s / T))
 
     def of_seed(seed):
-        return allan_variance(simulate_biases(STILL, edges_ns, seed, T)[1000:, AXES["gyro"]], 10 * tau_s)
+        return allan_variance(
+            simulate_biases(STILL, edges_ns, np.random.default_rng(seed), T)[1000:, AXES["gyro"]], 10 * tau_s
+        )
 
     assert_allan(of_seed, expected)
 
 
 def test_gauss_markov_biases_start_at_turn_on_and_are_bounded():
     T, edges_ns = 2.0, np.arange(0, 301) * 100_000_000
-    b = np.stack([simulate_biases(STILL, edges_ns, seed, T) for seed in range(300)])
-    walking = np.stack([simulate_biases(STILL, edges_ns, seed) for seed in range(300)])
+    b = np.stack([simulate_biases(STILL, edges_ns, np.random.default_rng(seed), T) for seed in range(300)])
+    walking = np.stack([simulate_biases(STILL, edges_ns, np.random.default_rng(seed)) for seed in range(300)])
     assert np.array_equal(b[:, 0], walking[:, 0])
     in_run = b - b[:, :1]
     for sensor, axes in AXES.items():
@@ -282,16 +288,16 @@ def test_gauss_markov_biases_start_at_turn_on_and_are_bounded():
 
 def test_gauss_markov_biases_with_a_long_memory_walk():
     edges_ns = np.arange(0, 1001) * 10_000_000
-    walk, memory = (simulate_biases(STILL, edges_ns, 1, T) for T in (None, 1e7))
+    walk, memory = (simulate_biases(STILL, edges_ns, np.random.default_rng(1), T) for T in (None, 1e7))
     scale = np.std(walk, axis=0)
     np.testing.assert_allclose(memory / scale, walk / scale, rtol=0, atol=1e-5)
 
 
 def test_the_logs_truth_holds_the_gauss_markov_biases():
-    log = simulate(Scenario(duration_s=30, imu=ImuSpec(STILL, bias_correlation_s=5.0)), 3)
-    expected = simulate_biases(STILL, np.arange(3001) * 10_000_000, 3, 5.0)
+    log = simulate(Scenario(duration_s=30, imu=ImuSpec(STILL, faults=ImuFaults(bias_correlation_s=5.0))), 3)
+    expected = simulate_biases(STILL, np.arange(3001) * 10_000_000, random_stream("lawnmower", "imu_bias", 3), 5.0)
     assert np.array_equal(np.hstack([log.truth.b_a, log.truth.b_g]), expected)
-    assert "imu biases: Gauss–Markov, correlated over 5 s." in log.notes
+    assert "imu faults: bias_correlation_s 5." in log.notes
 
 
 def test_better_grades_are_better():

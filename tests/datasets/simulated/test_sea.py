@@ -1,22 +1,31 @@
 """Waves against the equations of fluid motion, and what vehicle and sensors make of them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from fathom.bench.execution.drive import run_log
 from fathom.datasets import DatasetError
 from fathom.datasets.mounting import MountingSpec
+from fathom.datasets.simulated.faults import HeadingFaults
 from fathom.datasets.simulated.missions import fly
 from fathom.datasets.simulated.motion import AFLOAT_M
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.sea import Sea
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.simulated.specs import DepthSpec, GpsSpec, HeadingSpec, ImuSpec, TideSpec, WavesSpec
+from fathom.datasets.simulated.specs import DepthSpec, DepthTold, GpsSpec, HeadingSpec, ImuSpec, TideSpec, WavesSpec
+from fathom.datasets.state import POSITION
+from fathom.estimators import create
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 WAVES = WavesSpec(height_m=1.0, period_s=6.0, towards_deg=130.0)
 
 
-def sea_of(waves: WavesSpec | None = WAVES, tide: TideSpec | None = None, seed: int = 1) -> Sea:
-    sea = Sea.of(Scenario(waves=waves, tide=tide), seed)
+def sea_of(
+    waves: WavesSpec | None = WAVES, tide: TideSpec | None = None, seed: int = 1, mission: str = "lawnmower"
+) -> Sea:
+    sea = Sea.of(Scenario(mission=mission, waves=waves, tide=tide), seed)
     assert sea is not None
     return sea
 
@@ -95,19 +104,20 @@ def test_the_truth_contains_the_waves_and_its_derivatives_match():
 
 
 def test_a_vehicle_afloat_rides_on_the_waves():
-    motion, sea = fly(calm_and_rough(duration_s=60, surface_for_s=60)[1], 1), sea_of()
+    """As the water does that would be there in a flat sea: the wave moves both along by as much as a wave's height."""
+    calm, rough = (fly(scenario, 1) for scenario in calm_and_rough(duration_s=60, surface_for_s=60))
     t_s = np.linspace(0, 8, 200)
-    p = motion.position(t_s)
-    draught_m = p[:, 2] - sea.rise_m(t_s, p * [1, 1, 0])
-    assert np.ptp(p[:, 2]) > 0.5
-    np.testing.assert_allclose(draught_m, AFLOAT_M, atol=0.06)
+    height_m = rough.position(t_s)[:, 2]
+    draught_m = height_m - sea_of().rise_m(t_s, calm.position(t_s) * [1, 1, 0])
+    assert np.ptp(height_m) > 0.5
+    np.testing.assert_allclose(draught_m, AFLOAT_M, atol=0.03)
 
 
 def test_heave_fades_with_depth_as_each_wave_does():
     calm, rough = calm_and_rough(mission="transit", duration_s=6000, surface_every_s=6000, depth_m=8.0)
     t_s = np.arange(200, 5800, 0.5)
     heave_m = fly(rough, 1).position(t_s)[:, 2] - fly(calm, 1).position(t_s)[:, 2]
-    sea = sea_of()
+    sea = sea_of(mission="transit")
     k = sea.frequency_rad_s**2 / 9.81
     expected = np.sqrt(np.mean(np.exp(-2 * k * 8.1))) / 4
     assert np.std(heave_m) == pytest.approx(expected, rel=0.05)
@@ -122,7 +132,9 @@ def test_a_leaning_vehicle_feels_no_force_sideways():
         rough = Scenario(noise_scale=0, waves=WavesSpec(height_m=0.3, towards_deg=towards), **values)
         log = simulate(Scenario.from_dict(rough.to_dict() | {"imu": {"mounting": {}}}), 1)
         afloat = slice(0, 6000)
-        slope = sea_of(rough.waves).slope(log.truth.t_ns[afloat] * 1e-9, log.truth.p_WB_W[afloat])
+        slope = sea_of(rough.waves, mission=rough.mission).slope(
+            log.truth.t_ns[afloat] * 1e-9, log.truth.p_WB_W[afloat]
+        )
         side[towards] = np.std(log.imu.f_I[afloat, :2], axis=0) / (9.81 * np.std(np.linalg.norm(slope, axis=1)))
     assert side[120][1] < 0.1  # waves abeam: roll
     assert side[30][0] < 0.1  # waves ahead: pitch
@@ -144,7 +156,7 @@ def test_a_pressure_sensor_hardly_sees_the_waves_that_it_rides():
 
 def test_the_depth_sensor_reads_the_pressure_above_it():
     _, rough = calm_and_rough(mission="yo-yo", duration_s=120, depth=DepthSpec(rate_hz=5))
-    log, sea = simulate(rough, 3), sea_of(seed=3)
+    log, sea = simulate(rough, 3), sea_of(seed=3, mission=rough.mission)
     rows = np.searchsorted(log.truth.t_ns, log.depth.t_ns)
     p = log.truth.p_WB_W[rows] + log.truth.R_WB[rows] @ log.rig.depth.p_BS_B
     np.testing.assert_allclose(log.depth.z[:, 0], p[:, 2] - sea.rise_m(log.depth.t_ns * 1e-9, p), atol=1e-9)
@@ -168,6 +180,52 @@ def test_a_tide_over_a_recorded_path_shows_in_the_depth_alone():
     assert np.array_equal(plain.truth.p_WB_W, tidal.truth.p_WB_W)
     rise_m = np.sin(2 * np.pi * tidal.depth.t_ns * 1e-9 / 3600)
     np.testing.assert_allclose((plain.depth.z - tidal.depth.z)[:, 0], rise_m, atol=1e-12)
+
+
+def test_a_tide_that_is_told_is_in_the_depth_readings():
+    scenario = Scenario(duration_s=1200, noise_scale=0.0, tide=TideSpec(amplitude_m=2.0, period_h=6.0, told=True))
+    log = simulate(scenario, 1)
+    rows = np.searchsorted(log.truth.t_ns, log.depth.t_ns)
+    p_WP_W = log.truth.p_WB_W[rows] + log.truth.R_WB[rows] @ log.rig.depth.p_BS_B
+    np.testing.assert_allclose(log.depth.z[:, 0], p_WP_W[:, 2], atol=1e-9)
+    assert np.ptp(log.truth.p_WB_W[:, 2]) > 20
+
+
+@pytest.mark.parametrize(("z_m", "period_s"), [(-0.1, 0.1), (-8.0, 0.1), (-0.1, 1.0)])
+def test_waves_are_told_as_the_least_white_noise_that_no_mean_of_them_exceeds(z_m: float, period_s: float) -> None:
+    """Against the means of many readings of 14 hours of waves at one place, over windows of every length."""
+    sea, told = sea_of(), sea_of().swell_sigma_m(np.array([z_m]), period_s)[0]
+    t_s = np.arange(0, 50_000, period_s)
+    rise_m = sea.rise_m(t_s, np.tile([0.0, 0.0, z_m], (len(t_s), 1)))
+    summed = np.concatenate([[0.0], np.cumsum(rise_m)])
+    counts = np.unique(np.geomspace(1, 100 / period_s, 60).astype(int))
+    share = np.array([np.var((summed[n:] - summed[:-n]) / n) * n for n in counts]) / told**2
+    assert 0.75 < share.max() < 1.01
+
+
+def test_waves_are_in_the_depth_sensors_sigma_unless_the_scenario_leaves_them_out():
+    log = simulate(Scenario(duration_s=60, waves=WAVES), 1)
+    untold = simulate(Scenario(duration_s=60, waves=dataclasses.replace(WAVES, told=False)), 1)
+    fixed = simulate(Scenario(duration_s=60, waves=WAVES, depth=DepthSpec(told=DepthTold(sigma_m=0.3))), 1)
+    assert np.all(untold.depth.sigma == 0.02)
+    assert np.all(fixed.depth.sigma == 0.3)
+    z = simulate(Scenario(duration_s=60, waves=WAVES, noise_scale=0.0), 1).depth.z[:, 0]
+    np.testing.assert_allclose(log.depth.sigma[:, 0], np.hypot(0.02, sea_of().swell_sigma_m(z, 0.1)))
+    for other in (untold, fixed):
+        assert np.array_equal(other.depth.z, log.depth.z)
+
+
+def test_an_estimator_of_waves_that_are_told_does_not_overclaim_its_height():
+    """Twelve seeds, early and late; of waves that are not told the same sum is hundreds of times larger."""
+    squared = []
+    for seed in range(12):
+        log = simulate(Scenario(mission="transit", duration_s=40, waves=WAVES, heading=None), seed)
+        track = run_log(log, create("eskf")).online
+        for t_s in (2, 10, 40):
+            row = np.searchsorted(track.t_ns, t_s * 10**9)
+            true = log.truth.p_WB_W[np.searchsorted(log.truth.t_ns, track.t_ns[row]), 2]
+            squared.append((track.p_WB_W[row, 2] - true) ** 2 / track.P[row, POSITION, POSITION][2, 2])
+    assert sum(squared) < chi2.ppf(0.999, len(squared))
 
 
 def antenna_above_m(log, sea: Sea | None) -> np.ndarray:
@@ -199,7 +257,7 @@ def test_gps_needs_its_time_after_every_dive(waves):
 
 
 def test_soft_iron_deviates_a_heading_twice_around():
-    soft = HeadingSpec(soft_iron_deg=3.0, soft_iron_axis_deg=20.0, bias_deg=1.0)
+    soft = HeadingSpec(faults=HeadingFaults(soft_iron_deg=3.0, soft_iron_axis_deg=20.0, bias_deg=1.0))
     plain, bent = (
         simulate(Scenario(mission="box", duration_s=600, heading=spec, noise_scale=0.0), 1).heading.z
         for spec in (HeadingSpec(), soft)
@@ -219,13 +277,13 @@ def test_the_sea_is_noted():
         waves=WAVES,
         tide=TideSpec(),
         gps=GpsSpec(reacquisition_s=5),
-        heading=HeadingSpec(soft_iron_deg=2),
+        heading=HeadingSpec(faults=HeadingFaults(soft_iron_deg=2)),
     )
     assert simulate(scenario, 1).notes[1:] == (
-        "waves: height_m 1, period_s 6, towards_deg 130.",
-        "tide: amplitude_m 1, period_h 12.42, phase_deg 0.",
+        "waves: told True, height_m 1, period_s 6, towards_deg 130.",
+        "tide: told False, amplitude_m 1, period_h 12.42, phase_deg 0.",
         "gps: reacquisition_s 5.",
-        "heading: soft_iron_deg 2.",
+        "heading faults: soft_iron_deg 2.",
     )
 
 

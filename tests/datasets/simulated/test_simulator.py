@@ -1,6 +1,7 @@
 """The simulator against the definitions: what an IMU's companions report, how noisy they are, and what a seed fixes."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from fathom.datasets import DatasetError, ImuNoise, Log, open_log
 from fathom.datasets.described.folder import write_folder
 from fathom.datasets.epochs import cut
 from fathom.datasets.mounting import MountingSpec
+from fathom.datasets.simulated.faults import HeadingFaults
 from fathom.datasets.simulated.imu import simulate_biases
 from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.random_streams import RANDOM_STREAMS, random_stream
@@ -30,7 +32,7 @@ from fathom.datasets.simulated.specs import (
 )
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, kstest, uniform
+from scipy.stats import chi2, kstest, pearsonr, uniform
 
 SENSORS = ("dvl", "depth", "gps", "heading")
 
@@ -128,7 +130,8 @@ def test_readings_have_the_sigmas_they_state():
 
 def test_heading_bias_turns_every_heading_counter_clockwise():
     straight, biased = (
-        simulate(Scenario(duration_s=60, heading=HeadingSpec(bias_deg=bias)), 1).heading.z for bias in (0, 2)
+        simulate(Scenario(duration_s=60, heading=HeadingSpec(faults=HeadingFaults(bias_deg=bias))), 1).heading.z
+        for bias in (0, 2)
     )
     np.testing.assert_allclose(np.exp(1j * (biased - straight)), np.exp(1j * np.radians(2)), atol=1e-12)
     assert np.abs(simulate(Scenario(course_deg=179), 1).heading.z).max() <= np.pi
@@ -194,12 +197,16 @@ EVERYTHING = {
     "tide": {},
     "seabed": {"relief_m": 2},
     "imu": {
-        "bias_correlation_s": 100,
-        "faults": {"dropout_probability": 0.01, "outlier_probability": 0.01, "gyro_quantum_deg_s": 0.01},
+        "faults": {
+            "bias_correlation_s": 100,
+            "dropout_probability": 0.01,
+            "outlier_probability": 0.01,
+            "gyro_quantum_deg_s": 0.01,
+        },
     },
     "dvl": {"beam_loss_probability": 0.1, "max_tilt_deg": 15, "delay_s": 0.2, "faults": {"repeat_probability": 0.1}},
     "gps": {"reacquisition_s": 5, "faults": {"outages_s": [[3, 6]]}},
-    "heading": {"soft_iron_deg": 2, "disorder_s": 1, "faults": {"clock_offset_s": 0.05}},
+    "heading": {"disorder_s": 1, "faults": {"soft_iron_deg": 2, "clock_offset_s": 0.05}},
 }
 
 
@@ -221,7 +228,7 @@ def test_dropping_or_changing_one_sensor_changes_no_other(sensor):
         "dvl": DvlSpec(beam_sigma_m_s=0.02, rate_hz=7),
         "depth": DepthSpec(sigma_m=0.1),
         "gps": GpsSpec(rate_hz=2),
-        "heading": HeadingSpec(bias_deg=5),
+        "heading": HeadingSpec(faults=HeadingFaults(bias_deg=5)),
     }[sensor]
     expected = arrays(simulate(base, 7), sensor)
     for value in (None, other_spec):
@@ -237,14 +244,32 @@ def test_changing_the_imu_changes_neither_path_nor_aiding():
 
 
 def test_a_longer_log_begins_with_the_same_noise():
-    short, long = (simulate_biases(IMU_GRADES["tactical"], np.arange(n) * 10_000_000, 3) for n in (100, 200))
+    short, long = (
+        simulate_biases(IMU_GRADES["tactical"], np.arange(n) * 10_000_000, np.random.default_rng(3)) for n in (100, 200)
+    )
     assert np.array_equal(short, long[:100])
 
 
 def test_random_streams_are_distinct():
     assert len(set(RANDOM_STREAMS.values())) == len(RANDOM_STREAMS)
-    draws = [random_stream(seed, cause).random() for seed in range(5) for cause in RANDOM_STREAMS]
+    keys = itertools.product([*MISSIONS, "recorded"], RANDOM_STREAMS, [0, 1, 2**32, 2**63 - 1])
+    draws = [random_stream(*key).random() for key in keys]
     assert len(set(draws)) == len(draws)
+
+
+def test_two_missions_of_one_seed_are_two_experiments():
+    """Not one error of any sensor, of the biases or of the prior is shared, nor correlated."""
+    noisy, quiet = (
+        [simulate(Scenario(mission=mission, duration_s=60, noise_scale=scale), 7) for mission in ("box", "transit")]
+        for scale in (1.0, 0.0)
+    )
+    for name in ("imu.w", "imu.f", "dvl.z", "depth.z", "heading.z"):
+        box, transit = (
+            np.diff(arrays(log)[name] - arrays(still)[name], axis=0) for log, still in zip(noisy, quiet, strict=True)
+        )
+        assert abs(pearsonr(box.ravel(), transit.ravel()).statistic) < 4 / np.sqrt(box.size), name
+    for one in (lambda log: log.truth.b_g[0], lambda log: log.prior.state.local(log.truth.state(0))):
+        assert not np.intersect1d(*map(one, noisy)).any()
 
 
 # -- the log as a whole
@@ -278,6 +303,35 @@ def test_the_log_says_what_it_is():
     assert log.truth_kind == "truth"
     custom = ImuNoise(1e-4, 1e-3, 0.0, 0.0, 1e-4, 1e-2)
     assert simulate(Scenario(duration_s=60, imu=custom, mission="yo-yo"), 7).name == "yo-yo-custom-s7"
+
+
+TOLD = {
+    "imu": {"noise": "consumer"},
+    "dvl": {"beam_sigma_m_s": 0.05},
+    "depth": {"sigma_m": 0.3},
+    "gps": {"horizontal_sigma_m": 4, "vertical_sigma_m": 9},
+    "heading": {"sigma_deg": 6},
+    "prior": {"attitude_deg": 3, "position_m": 4, "velocity_m_s": 0.5},
+}
+
+
+@pytest.mark.parametrize("part", TOLD)
+def test_what_is_told_changes_what_the_log_states_and_nothing_that_it_measures(part: str) -> None:
+    plain = Scenario(duration_s=60)
+    odd = Scenario.from_dict({"duration_s": 60, part: {"told": TOLD[part]}})
+    log, other = simulate(plain, 3), simulate(odd, 3)
+    stated = {f"{part}.sigma"} if part in SENSORS else set()
+    before, after = arrays(log), arrays(other)
+    assert {name for name in before if not np.array_equal(before[name], after[name])} == stated
+    assert (log.rig.imu_noise == other.rig.imu_noise) == (part != "imu")
+    assert np.array_equal(log.prior.P, other.prior.P) == (part not in ("imu", "prior"))
+    assert other.notes[-1].startswith(f"{part} is told otherwise than simulated: ")
+    assert odd.truly_told == plain
+    as_if = simulate(Scenario.from_dict({"duration_s": 60, part: TOLD[part]}), 3)
+    if part in SENSORS:
+        assert np.array_equal(getattr(other, part).sigma, getattr(as_if, part).sigma)
+    assert other.rig.imu_noise == as_if.rig.imu_noise
+    assert np.array_equal(other.prior.P, as_if.prior.P)
 
 
 # -- scenarios
@@ -324,6 +378,9 @@ def test_the_page_on_the_simulator_shows_every_dial_at_its_default():
         ({"gps_mounting": {}}, ["`gps_mounting` is called `gps.mounting` now"]),
         ({"imu": {"mounting": {"lever_arm_m": [0, 0, 0]}}}, ["lever_arm_m` is called `translation_m` now"]),
         ({"imu": {"gyro_density": 1e-4}}, ["`imu.gyro_density` is called `noise.gyro_density` now"]),
+        ({"imu": {"bias_correlation_s": 5}}, ["`imu.bias_correlation_s` is called `faults.bias_correlation_s` now"]),
+        ({"heading": {"bias_deg": 5}}, ["`heading.bias_deg` is called `faults.bias_deg` now"]),
+        ({"imu": {"told": {"noise": "tacticel"}}}, ["imu.told.noise", "did you mean 'tactical'"]),
         ({"gyro_density": 1e-4}, ["unknown key `gyro_density`"]),
         ({"dvl": {"lever_arm_m": [0, 0, 0]}}, ["unknown key `dvl.lever_arm_m`"]),
         ({"speed_mps": 1, "depth_mounting": {}}, ["`speed_mps` is called", "`depth_mounting` is called"]),

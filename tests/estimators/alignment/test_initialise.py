@@ -10,6 +10,7 @@ from fathom.datasets import ImuNoise, Log, Mounting, Rig
 from fathom.datasets.epochs import cut
 from fathom.datasets.log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, ImuStream
 from fathom.datasets.mounting import MountingSpec
+from fathom.datasets.simulated.faults import HeadingFaults
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import GpsSpec, HeadingSpec
@@ -203,7 +204,7 @@ def path(seed: int, rest_s: float, m_s2: float | None = None) -> Trajectory:
 def afloat(seed: int, motion: Trajectory | None = None, **dials: object) -> Log:
     """A log without a prior; a compass errs by its sigma, and evenly so, beside its noise."""
     bias_deg = float(np.random.default_rng(900 + seed).normal()) * float(dials.get("noise_scale", 1.0))
-    dials = {"heading": HeadingSpec(bias_deg=bias_deg)} | dials
+    dials = {"heading": HeadingSpec(faults=HeadingFaults(bias_deg=bias_deg))} | dials
     if motion is not None:
         dials |= {"mission": "recorded"}
     return replace(simulate(replace(AFLOAT, **dials), seed, motion), prior=None)
