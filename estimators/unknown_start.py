@@ -26,10 +26,15 @@ class StartError(ValueError):
     """An estimator cannot take the start that it is given; the message says what is unknown and what to do."""
 
 
+def yaw_sigma_rad(belief: Belief) -> float:
+    """Return the sigma of the yaw, rad."""
+    up_B = belief.state.R_WB[2]
+    return float(np.sqrt(up_B @ belief.P[THETA, THETA] @ up_B))
+
+
 def knows_heading(belief: Belief) -> bool:
     """Return whether the sigma of the yaw is not above MOST_YAW_RAD."""
-    up_B = belief.state.R_WB[2]
-    return not up_B @ belief.P[THETA, THETA] @ up_B > MOST_YAW_RAD**2
+    return not yaw_sigma_rad(belief) > MOST_YAW_RAD
 
 
 def refuse_unknown_heading(belief: Belief) -> None:
