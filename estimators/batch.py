@@ -34,7 +34,8 @@ class BatchSmoother(WholeLogSmoother):
         """See `Estimator.begin`."""
         if self.engine == "gtsam":
             return super().begin(prior, rig)
-        refuse_unknown_heading(prior)
+        if self.preintegrates:
+            refuse_unknown_heading(prior)
         refuse_unknown_velocity(prior)
         solving = Solving(self.relinearize, self.extra_updates, reach=GUESS_KEYFRAMES, to_optimum=True)
         return WindowPass(self, solving, prior, rig)

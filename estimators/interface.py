@@ -84,7 +84,11 @@ class Pass(Protocol):
 
 @runtime_checkable
 class Estimator(Protocol):
-    """A frozen configuration; `factors` are the sensors it may use."""
+    """A frozen configuration; `factors` are the sensors it may use.
+
+    One that is honest only where it is started with a heading known to some sigma may say so in an attribute
+    `honest_yaw_rad`. A run that starts with less is told of under the table.
+    """
 
     @property
     def factors(self) -> frozenset[str]:

@@ -222,7 +222,7 @@ def run_log(
         (end_ns - voyage.start_ns) * 1e-9,
         sum(len(epoch.imu) for epoch in driven),
         start,
-        (*notes, *noticed(log, counts)),
+        (*notes, *noticed(log, counts, estimator)),
         collector.table() if collector else None,
         ending.traceback,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from ...datasets.log import Log, ReadingStream
 from ...datasets.notes import Note
 from ...estimators.interface import OUTLIERS
+from ...estimators.unknown_start import yaw_sigma_rad
 
 ON_TIME_NS = 1_000_000
 """A reading received at most this long after it was true came in time: 1 ms, in which 2 m/s is 2 mm."""
@@ -32,14 +34,23 @@ def _between(stream: ReadingStream, start_ns: int, end_ns: int) -> NDArray[np.bo
     return (stream.t_ns > start_ns) & (stream.received_ns <= end_ns) & measures
 
 
-def noticed(log: Log, counts: Mapping[str, int]) -> tuple[Note, ...]:
+def noticed(log: Log, counts: Mapping[str, int], estimator: object = None) -> tuple[Note, ...]:
     """Return a note for whatever a run noticed.
 
     Args:
         log: what was driven through.
         counts: of the run, see `Result.counts`.
+        estimator: its configuration; one that states `honest_yaw_rad` is warned of by that.
     """
-    return (*_of_streams(log), *_of_counts(log, counts))
+    return (*_of_start(log, estimator), *_of_streams(log), *_of_counts(log, counts))
+
+
+def _of_start(log: Log, estimator: object) -> Iterator[Note]:
+    """Yield where the heading at the start is known less well than the estimator needs to be honest."""
+    most_rad = getattr(estimator, "honest_yaw_rad", None)
+    if log.prior is not None and isinstance(most_rad, float) and (sigma_rad := yaw_sigma_rad(log.prior)) > most_rad:
+        known, most = (f"{math.degrees(angle):.0f}°" for angle in (sigma_rad, most_rad))
+        yield Note(f"the heading at the start has a sigma of {known}, and it is honest up to {most}", "overclaims")
 
 
 def _of_streams(log: Log) -> Iterator[Note]:

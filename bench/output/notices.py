@@ -22,6 +22,7 @@ WORDS = {
     "dropped": "left out on reading",
     "repaired": "changed on reading",
     "start": "start",
+    "overclaims": "claims more than it knows",
     "gap": "IMU gaps bridged",
     "outside": "outside the IMU's time",
     "late_dropped": "late and dropped",
@@ -36,7 +37,7 @@ assert list(WORDS) == [kind for kind in KINDS if kind != "about"]
 PLACES = {kind: place for place, kind in enumerate(WORDS)}
 ROUTINE = ("outside", "late", "merged", "carried", "void")
 """Kinds that are no fault of a log; the terminal has one line for each, of the log where it is most."""
-IN_WORDS = ("damage", "check", "silent", "repaired", "start")
+IN_WORDS = ("damage", "check", "silent", "repaired", "start", "overclaims")
 """Kinds whose sentences say more than a number."""
 TEXT_LETTERS = 150
 """Of a note's sentence in a line: two lines of a terminal of 80 columns."""
@@ -54,7 +55,8 @@ class Notice:
         stream: which sensor; "" for the whole log.
         texts: the different sentences.
         count, of, seconds: of the run with the largest share; None where not known.
-        label: the estimator of that run, where others have another count; else "".
+        label: the estimator of that run, where others have another count; of a note without a count, every estimator
+            that has it, where others do not; else "".
         varies: whether seeds or estimators have other counts.
     """
 
@@ -91,7 +93,7 @@ def notices(rows: Sequence[Record]) -> list[Notice]:
     for (log,), of_log in groups(rows, "log").items():
         runs = [row for row, *_ in groups(of_log, "label", "seed").values() if row["notes"]]
         for (kind, stream), each in _by_kind(runs).items():
-            found.append(_notice(log, kind, stream, each, len({row["label"] for row in runs})))
+            found.append(_notice(log, kind, stream, each, len({row["label"] for row in of_log})))
     return sorted(found, key=lambda notice: PLACES[notice.kind])
 
 
@@ -130,7 +132,7 @@ def _notice(log: str, kind: str, stream: str, each: Sequence[tuple[Record, dict[
     by_label = {run["label"]: note.get("count") for run, note in each if run["seed"] == row["seed"]}
     same = len(by_label) == labels and len(set(by_label.values())) == 1
     texts = tuple(dict.fromkeys(text for _, note in each for text in note["texts"]))
-    label = "" if same else row["label"]
+    label = "" if same else row["label"] if worst.get("count") is not None else ", ".join(by_label)
     return Notice(
         log, kind, stream, texts, worst.get("count"), worst["of"], worst.get("seconds"), label, len(counts) > 1
     )
@@ -168,7 +170,8 @@ def _sentence(kind: str, of: Sequence[Notice]) -> str:
         return f"{WORDS[kind]}: {'; '.join(amount.strip() for amount in amounts)}"
     texts = list(dict.fromkeys(text for notice in of for text in notice.texts))
     more = f" (and {len(texts) - 1} more, in the report)" if len(texts) > 1 else ""
-    return f"{WORDS[kind]}: {shorten(texts[0], TEXT_LETTERS, placeholder=' …')}{more}"
+    by = f" ({of[0].label})" if of[0].label else ""
+    return f"{WORDS[kind]}{by}: {shorten(texts[0], TEXT_LETTERS, placeholder=' …')}{more}"
 
 
 def sentences(rows: Sequence[Record]) -> list[str]:

@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
-from ...datasets.state import DIM, THETA, Array
-from ..physics.blocks import clear
+from ...datasets.state import DIM, THETA, VELOCITY, Array
+from ..physics.blocks import clear, identity, set_block, set_product
 from ..physics.elimination import add_scaled, decorrelate
 from ..physics.imu import predict, process_noise
+from ..physics.invariant import as_invariant, congruent, error_after_invariant, local_invariant, to_invariant
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import exp_into, product_into, right_jacobian_into, skew_into, transform_into
-from ..physics.state import POSITION_0, STATE, VELOCITY_0, local, turn_covariance, turn_rows
+from ..physics.state import STATE, THETA_0, VELOCITY_0, turn_rows
+from ..physics.tie import mixed_jacobian_into, tie_residual
 from ..robust import weight_of
 from .chain import copy_into
 
@@ -173,57 +175,62 @@ def linearise_tie(
 ) -> None:
     """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; docs/window.md (4).
 
-    With x the prediction from x_i, the residual is in the axes of B at j, as GTSAM's does (it matters only where
-    one of the two is kept while the other moves):
-
-        e = Log(Rᵀ R_j)     R_jᵀ e_p = R_jᵀ (p_j − p)     R_jᵀ e_v = R_jᵀ (v_j − v)     b_j − b
-
-    Where x_j lies e off x, a rotation error that starts at x is carried there by Exp(−e), noise by J_r(e), and the two
-    positions and velocities are seen turned by it: δp_j gains −[e_p]× R_j δθ_j, and δv_j likewise.
+    It is `tie_residual` solved for δ_j. Where x_j lies e = x_j ⊖ x⁻ off the prediction x⁻ from x_i, with the residual's
+    rotation φ and velocity ν, an error (θ, e_v) that starts at x⁻ is carried there by the adjoint of SE_2(3), and noise
+    by its right Jacobian, whose lower block is that of the left at −φ, −ν.
     """
-    end, matrices, e = np.empty(1, STATE), np.empty((3, 3, 3)), np.empty(3)
-    turn, S, A = matrices[0], matrices[1], matrices[2]
+    end, matrices, r, gap, minus = np.empty(1, STATE), np.empty((8, 3, 3)), np.empty(DIM), np.empty(3), np.empty((2, 3))
+    turn, S, J, mixed = matrices[0], matrices[1], matrices[2], matrices[3]
+    M, scratch = np.empty((DIM, DIM)), np.empty((DIM, DIM))
     predict(block, x_i, gravity, F, end)
     process_noise(block, x_i[0].R_WB[:], Q)
-    local(end, x_j, c)
+    tie_residual(end, x_j, r)
+    s, x = x_j[0], end[0]
     for i in range(3):
-        e[i] = c[i]
+        gap[i] = x.v_WB_W[i] - s.v_WB_W[i]
+        minus[0, i], minus[1, i] = -r[THETA_0 + i], -r[VELOCITY_0 + i]
     for i in range(DIM):
-        c[i] = -c[i]
-    exp_into(c[THETA], turn)
+        c[i] = -r[i]
+    transform_into(s.R_WB[:], minus[1], c[VELOCITY])
+    exp_into(minus[0], turn)
     turn_rows(F, turn)
-    right_jacobian_into(e, S)
-    turn_covariance(Q, S)
-    for begin in (POSITION_0, VELOCITY_0):  # what p and v gain by the rotation of j; c is minus the residual
-        skew_into(c[begin : begin + 3], S)
-        product_into(S, x_j[0].R_WB[:], A)
-        for i in range(3):
-            for k in range(3):
-                c[begin + i] += A[i, k] * c[k]
-                for j in range(DIM):
-                    F[begin + i, j] += A[i, k] * F[k, j]
-                    Q[begin + i, j] += A[i, k] * Q[k, j]
-        for i in range(3):
-            for k in range(3):
-                for j in range(DIM):
-                    Q[j, begin + i] += A[i, k] * Q[j, k]
+    skew_into(gap, S)
+    product_into(S, s.R_WB[:], turn)
+    for i in range(3):
+        for k in range(3):
+            for j in range(DIM):
+                F[VELOCITY_0 + i, j] += turn[i, k] * F[THETA_0 + k, j]
+    right_jacobian_into(r[THETA], J)
+    mixed_jacobian_into(minus[0], minus[1], mixed, matrices[5:8])
+    identity(M)
+    set_block(M, THETA_0, THETA_0, 1.0, J)
+    set_product(M, VELOCITY_0, THETA_0, 1.0, s.R_WB[:], mixed)
+    product_into(s.R_WB[:], J, S)
+    for i in range(3):
+        for j in range(3):
+            M[VELOCITY_0 + i, VELOCITY_0 + j] = S[i, 0] * x.R_WB[j, 0] + S[i, 1] * x.R_WB[j, 1] + S[i, 2] * x.R_WB[j, 2]
+    congruent(M, Q, scratch)
 
 
 @compiled
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
     """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor; docs/window.md (10).
 
+    What is normal is the invariant error ξ of x from the anchor (`invariant`), which the error at the anchor turns into
+    by its derivative there.
+
     Args:
         anchor, x: STATE records.
         mean, m, P: (15,), (15,), (15, 15).
     """
-    J, lacking = np.empty((3, 3)), np.empty(3)
-    local(anchor, x, m)
-    right_jacobian_into(m[THETA], J)
+    a, xi, at, K, scratch = anchor[0], np.empty(DIM), np.empty(DIM), np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    as_invariant(anchor, mean, xi)
+    local_invariant(anchor, x, at)
+    error_after_invariant(x, at, K)
+    copy_into(a.P[:], P)
+    congruent(to_invariant(a.R_WB[:], a.v_WB_W[:]), P, scratch)
+    congruent(K, P, scratch)
     for i in range(DIM):
-        m[i] = mean[i] - m[i]
-    for i in range(3):
-        lacking[i] = m[i]
-    transform_into(J, lacking, m[THETA])
-    copy_into(anchor[0].P[:], P)
-    turn_covariance(P, J)
+        m[i] = 0.0
+        for j in range(DIM):
+            m[i] += K[i, j] * (xi[j] - at[j])

@@ -20,9 +20,10 @@ from .window_pass import Solving, WindowPass
 class WindowSmoother(LaggedSmoother):
     """MAP over the last lag_s seconds on our own solver: Gauss–Newton on the chain of keyframes (docs/window.md).
 
-    It computes the estimate of `fls`, from the same factors at the same keyframes. A step factors the new block, and
-    the blocks since the oldest keyframe that was relinearised; then it substitutes back through the window once.
-    `refactored` and `relinearised` count blocks and keyframes.
+    It has the factors of `fls` at the same keyframes. A step factors the new block, and the blocks since the oldest
+    keyframe that was relinearised; then it substitutes back through the window once. `refactored` and `relinearised`
+    count blocks and keyframes. Its prior, stated and marginal, is normal in coordinates that hold for any yaw, so that
+    it takes an unknown heading, unless it sums the DVL.
 
     Attributes:
         relinearize: thresholds of rotation (rad), position (m), velocity (m/s) and bias (its units); a keyframe that
@@ -34,10 +35,11 @@ class WindowSmoother(LaggedSmoother):
 
     relinearize: tuple[NotNegative, NotNegative, NotNegative, NotNegative] = (0.005, 10.0, 0.05, 1.0)
     extra_updates: Annotated[Whole, Field(ge=0)] = 0
-    relinearize_prior: bool = False
+    relinearize_prior: bool = True
 
     def begin(self, prior: Belief, rig: Rig) -> Pass:
         """See `Estimator.begin`."""
-        refuse_unknown_heading(prior)
+        if self.preintegrates:
+            refuse_unknown_heading(prior)
         refuse_unknown_velocity(prior)
         return WindowPass(self, Solving(self.relinearize, self.extra_updates, self.relinearize_prior), prior, rig)

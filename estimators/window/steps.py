@@ -21,7 +21,8 @@ from ...datasets.state import DIM
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME
 from ..physics.elimination import absorb_row, divide_into
 from ..physics.imu import integrate, predict
-from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, retract
+from ..physics.invariant import move
+from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE
 from . import factors as forms
 from .chain import absorb_joint_row, back_substitute, copy_into, cross_tie
 from .factors import distance, linearise_factor, linearise_prior, linearise_tie
@@ -118,7 +119,7 @@ def make_keyframe(
     new.imu_from = end_of(w, imu, nodes[a].imu_from - v.imu_gone, t_ns) + v.imu_gone
     move_along(w, nodes, points, imu, rig, v.newest, t_ns, blocks[a : a + 1])
     x = np.empty(1, STATE)
-    retract(points[a : a + 1], nodes[a].d[:], x)
+    move(points[a : a + 1], nodes[a].d[:], x)
     predict(blocks[a : a + 1], x, rig[0].gravity, F, points[b : b + 1])
     new.t_ns, new.first, new.moved = t_ns, -1, 1
     for i in range(DIM):
@@ -207,7 +208,7 @@ def linearise(
     for k in range(low, v.newest + 1):
         a = k & mask
         if has_moved(w, nodes, a, exact):
-            retract(points[a : a + 1], nodes[a].d[:], points[a : a + 1])
+            move(points[a : a + 1], nodes[a].d[:], points[a : a + 1])
             for i in range(DIM):
                 nodes[a].d[i] = 0.0
             nodes[a].moved = 1

@@ -22,7 +22,8 @@ from ..interface import OUTLIERS, Diverged
 from ..keyframes import SUMMED, Keyframes
 from ..physics.dvl_preintegration import DISPLACEMENT, given_rotation, preintegrate_dvl
 from ..physics.imu import BLOCK, compile_rig, first_sample, over_world
-from ..physics.state import STATE, as_belief, as_record, inject, retract, with_rate_noise
+from ..physics.invariant import inject_moved, move
+from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import LOSSES, width
 from ..smoothers import GraphSmoother
 from ..stages import stage
@@ -113,7 +114,7 @@ class WindowPass:
         a = w["newest"] & (len(self._nodes) - 1)
         node, state = self._nodes[a], self._points[a : a + 1].copy()
         state["P"] = node["P"]
-        inject(state, node["m"])
+        inject_moved(state, node["m"])
         waiting = self._keyframes.not_given_out()
         if waiting or node["t_ns"] != self._now_ns:
             carry_on(state, self._rig, *self._samples(a), self._now_ns, waiting, self._config.robust)
@@ -172,7 +173,7 @@ class WindowPass:
         k, tight = int(orders[first, 1]), "preintegrated-tight" in self._config.dvl
         a = k & mask
         x = self._points[a : a + 1].copy()
-        retract(x, self._nodes[a]["d"], x)
+        move(x, self._nodes[a]["d"], x)
         begin, end = (int(self._nodes["imu_from"][j & mask] - self._w["imu_gone"][0]) for j in (k, k + 1))
         imu = over_world(self._imu[begin:end], x[0]["R_WB"], x[0]["b_g"], self._rig)
         displacement = preintegrate_dvl(
@@ -250,7 +251,7 @@ class WindowPass:
                 state["P"] = node["P_smoothed"]
             else:
                 state["P"] = np.nan
-            inject(state, node["d"])
+            inject_moved(state, node["d"])
             if t_ns != node["t_ns"]:
                 carry_on(state, self._rig, *self._samples(a), t_ns)
             self._smoothed.append((t_ns, state))

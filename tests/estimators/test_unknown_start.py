@@ -47,7 +47,7 @@ def still_unknown(log: Log) -> Log:
     return log.with_prior(replace(log.prior, P=P))
 
 
-WITH_DVL = ["eskf", "eskf-filterpy", "ukf", "rts", "fls", "fls-batch", "window"]
+WITH_DVL = ["eskf", "eskf-filterpy", "ukf", "rts", "fls", "fls-batch"]
 
 
 @pytest.mark.parametrize("name", WITH_DVL)
@@ -56,15 +56,18 @@ def test_a_velocity_in_the_body_is_refused_while_the_heading_is_unknown(log: Log
         run_log(replace(lost(log), heading=None), create(name))
 
 
-@pytest.mark.parametrize(("name", "options"), [("iekf", {}), ("isam2", {}), ("dead-reckoning", {})])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("iekf", {}), ("isam2", {}), ("window", {}), ("batch", {"engine": "window"}), ("dead-reckoning", {})],
+)
 def test_estimators_that_hold_for_any_yaw_take_an_unknown_heading(log: Log, name: str, options: dict[str, Any]) -> None:
     assert run_log(replace(lost(log), heading=None), create(name, **options)).online is not None
 
 
 def test_sums_of_the_dvl_need_a_heading_on_every_solver(log: Log) -> None:
-    for name in ("isam2", "batch"):
+    for name, options in (("isam2", {}), ("batch", {}), ("batch", {"engine": "window"}), ("window", {})):
         with pytest.raises(StartError, match="heading"):
-            run_log(lost(log), create(name, dvl=["preintegrated-loose"]))
+            run_log(lost(log), create(name, dvl=["preintegrated-loose"], **options))
 
 
 @pytest.mark.parametrize("name", ["eskf", "ukf"])

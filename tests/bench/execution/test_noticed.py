@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from fathom.bench import run_log
@@ -10,6 +11,7 @@ from fathom.bench.execution.noticed import late_readings, noticed
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.log import Log
 from fathom.datasets.notes import Note, as_data
+from fathom.datasets.state import THETA
 from fathom.estimators import create
 
 COUNTS = {"readings": 0, "readings_late": 0, "readings_void": 0, "imu_gaps_bridged": 0}
@@ -43,6 +45,21 @@ def test_readings_outside_the_imu_are_told_with_their_share() -> None:
     assert note.of == len(log.streams["dvl"])
     assert note.share is not None
     assert 0.4 < note.share < 0.6
+
+
+def test_an_estimator_is_told_of_where_the_heading_at_the_start_is_known_less_well_than_it_needs() -> None:
+    log = dive()
+    assert log.prior is not None
+    up_B, P = log.prior.state.R_WB[2], log.prior.P.copy()
+    P[THETA, THETA] += np.radians(25.0) ** 2 * np.outer(up_B, up_B)
+    lost = log.with_prior(replace(log.prior, P=P))
+    plain, honest = SimpleNamespace(honest_yaw_rad=np.radians(20.0)), SimpleNamespace(honest_yaw_rad=np.radians(30.0))
+    assert [kinds(noticed(lost, COUNTS, one)).keys() for one in (plain, honest, object())] == [
+        {("overclaims", "")},
+        *2 * [set()],
+    ]
+    assert not noticed(log, COUNTS, plain)
+    assert "25°" in noticed(lost, COUNTS, plain)[0]
 
 
 def test_what_a_run_counts_is_told_worst_first() -> None:

@@ -62,6 +62,12 @@ def test_the_estimator_is_named_where_another_counts_otherwise() -> None:
     ]
 
 
+def test_every_estimator_that_overclaims_is_named() -> None:
+    note = Note("the heading is unknown", "overclaims")
+    told = lines(row("dive", "eskf", note), row("dive", "ukf", note), row("dive", "window"))
+    assert told == ["dive: claims more than it knows (eskf, ukf): the heading is unknown"]
+
+
 def test_the_worst_seed_is_told() -> None:
     told = lines(*(row("box", "eskf", gated(n), seed=n) for n in (1, 30, 2)))
     assert told == ["box: gated, or given less weight: gps up to 30 of 60 (50.0 %)"]
