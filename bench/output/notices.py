@@ -22,6 +22,7 @@ WORDS = {
     "dropped": "left out on reading",
     "repaired": "changed on reading",
     "start": "start",
+    "height": "height",
     "gap": "IMU gaps bridged",
     "outside": "outside the IMU's time",
     "late_dropped": "late and dropped",
@@ -36,7 +37,7 @@ assert list(WORDS) == [kind for kind in KINDS if kind != "about"]
 PLACES = {kind: place for place, kind in enumerate(WORDS)}
 ROUTINE = ("outside", "late", "merged", "carried", "void")
 """Kinds that are no fault of a log; the terminal has one line for each, of the log where it is most."""
-IN_WORDS = ("damage", "check", "silent", "repaired", "start")
+IN_WORDS = ("damage", "check", "silent", "repaired", "start", "height")
 """Kinds whose sentences say more than a number."""
 TEXT_LETTERS = 150
 """Of a note's sentence in a line: two lines of a terminal of 80 columns."""
@@ -168,6 +169,7 @@ def _sentence(kind: str, of: Sequence[Notice]) -> str:
         return f"{WORDS[kind]}: {'; '.join(amount.strip() for amount in amounts)}"
     texts = list(dict.fromkeys(text for notice in of for text in notice.texts))
     more = f" (and {len(texts) - 1} more, in the report)" if len(texts) > 1 else ""
+    more += f", by {of[0].label}" if of[0].label else ""
     return f"{WORDS[kind]}: {shorten(texts[0], TEXT_LETTERS, placeholder=' …')}{more}"
 
 
