@@ -12,6 +12,7 @@ KINDS = {
     "repaired": "values were changed on reading",
     "start": "heading or velocity was unknown at the start, or the start was moved",
     "overclaims": "the estimator was started where it is known to claim more than it knows",
+    "height": "nothing measures the height, and it is scored",
     "gap": "gaps in the IMU were bridged",
     "outside": "readings lay outside the IMU's time",
     "late_dropped": "readings came too late to be used",

@@ -53,6 +53,20 @@ def _of_start(log: Log, estimator: object) -> Iterator[Note]:
         yield Note(f"the heading at the start has a sigma of {known}, and it is honest up to {most}", "overclaims")
 
 
+def unmeasured_height(log: Log, sensors: Collection[str]) -> tuple[Note, ...]:
+    """Return a note where a score in 3D takes in the height of the truth, which none of these sensors measures."""
+    heard = {name: stream for name, stream in log.streams.items() if name in sensors and len(stream)}
+    if log.truth is None or "depth" in heard or not np.isfinite(log.truth.p_WB_W[:, 2]).any():
+        return ()
+    gps = heard.get("gps")
+    if gps is not None and np.isfinite(gps.sigma[:, 2]).any():
+        return ()
+    n = 0 if gps is None else len(gps)
+    fixes = f", and {n} of {n} fixes without a height" if gps is not None else " and no fix"
+    text = f"nothing measures the height (no depth{fixes}), which is scored in 3D; `dims: 2d` scores the horizontal"
+    return (Note(text, "height", "" if gps is None else "gps", n, n or None),)
+
+
 def _of_streams(log: Log) -> Iterator[Note]:
     """Yield which sensors have no reading, and which have readings outside the IMU's time."""
     first_ns, end_ns = int(log.imu.t_ns[0]) - log.imu.period_ns, int(log.imu.t_ns[-1])

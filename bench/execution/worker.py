@@ -32,6 +32,7 @@ from ..metrics.scoring import INNOVATIONS, by_reason, can_judge, scored
 from ..results.identity import content_sha256
 from ..results.store import Row
 from .drive import run_log, traceback_of, warm_up
+from .noticed import unmeasured_height
 from .result import Result, costs, innovation_dof, innovation_scores
 from .task import Finished, Stage, Task, file_name, parquet
 
@@ -153,7 +154,9 @@ class WorkerCache:
 
     def finished(self, task: Task, log: Log, result: Result, extra: Row) -> Finished:
         """Score a run: one row per output, and its trajectories beside them."""
-        scoring = task.scoring
+        scoring, notes = task.scoring, (*log.notes, *task.checked, *result.notes)
+        if scoring.dims == "3d" and result.online is not None:
+            notes += unmeasured_height(log, task.run.estimator.create().factors)
         files: dict[str, bytes] = {}
         shared = {
             "failed_at_s": result.failed_at_s,
@@ -162,7 +165,7 @@ class WorkerCache:
             "duration_s": result.duration_s,
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
-            "notes": json.dumps([as_data(note) for note in (*log.notes, *task.checked, *result.notes)]),
+            "notes": json.dumps([as_data(note) for note in notes]),
             **costs(result),
             **extra,
         }

@@ -15,6 +15,7 @@ from ...datasets.errors import DatasetError
 from ...datasets.log import Log
 from .findings.advice import resolved
 from .findings.finding import Check, Finding
+from .gross.datum import gps_height_check
 from .gross.gross import gross_check, unsaid
 from .gross.readings import reading_findings, without
 from .streams.imu_noise import check_imu_noise
@@ -126,6 +127,8 @@ def inspect_log(log: Log, repairs: Sequence[str] = (), description: Description 
         gross = replace(gross, findings=unsaid([f for check in checks for f in check.findings], gross.findings))
         faulty = broken | {finding.stream for finding in gross.findings}
         checks += [gross, *([] if "imu" in faulty else cross_checks(without(log, faulty)))]
+        if "gps" not in {finding.stream for check in checks for finding in check.findings}:
+            checks.append(gps_height_check(without(log, faulty)))
     if description is not None:
         checks = [replace(c, findings=tuple(resolved(f, description) for f in c.findings)) for c in checks]
     return Inspection(log, tuple(checks))

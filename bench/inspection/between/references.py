@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from ....datasets.log import Log
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
+from ..findings.advice import DEPTH_OFFSET
 from ..findings.finding import Check, Finding
 from ..findings.fitting import Estimate, Fit, Mask, blocks_of, least_squares, mean_of
+from ..gross.datum import ZERO_M, zero_finding
 from ..streams.channels import seconds
 from .inertial import Inertial, cross
 from .pair_check import Delay, PairCheck
@@ -173,7 +175,7 @@ def gps_against_truth(log: Log, reference: Reference) -> PairCheck | None:
         facts[f"GPS less {whose}, up"] = up.text("m")
         if up.differs(0.0, max(OFFSET_MATTERS_M, 2 * float(np.median(sigma[high, 2])))):
             message = f"GPS heights are {up.text('m')} above the {whose}'s: ellipsoid and geoid, or different origins."
-            findings.append(Finding("gps", message, f"streams.gps.geodetic.altitude.offset: {-up.value:.2f}"))
+            findings.append(Finding("gps", message, f"streams.gps: raise {-up.value:.2f}"))
     delays = (Delay("gps", "truth position", fit["delay"]),) if fit["delay"].known_to(1.0) else ()
 
     def draw(axes: Axes) -> None:
@@ -217,12 +219,11 @@ def depth_against_truth(log: Log, reference: Reference) -> PairCheck | None:
             findings.append(Finding("depth", message, fix))
     if offset.differs(0.0, DEPTH_OFFSET_MATTERS_M) and not findings:
         shift = offset.value
-        if log.truth_kind == "reference" or abs(shift) > 5.0:
-            fix = f"truth.position.offset: [0, 0, {-shift:.3f}]  # frame: NED; with ENU {shift:.3f}"
-        else:
-            fix = f"streams.depth.depth.offset: {shift:.3f}  # positive: down; with up {-shift:.3f}"
         message = f"The {whose}'s height is {offset.times(-1).text('m')} above the depth sensor's throughout."
-        findings.append(Finding("truth" if fix.startswith("truth") else "depth", message, fix))
+        of_truth = Finding("truth", message, f"truth: raise {shift:.3f}")
+        of_depth = Finding("depth", message, DEPTH_OFFSET.format(shift, -shift))
+        near = of_truth if log.truth_kind == "reference" else of_depth
+        findings.append(near if abs(shift) < ZERO_M else zero_finding(log, shift))
 
     def draw(axes: Axes) -> None:
         axes.plot(t_s, z, label="depth sensor")

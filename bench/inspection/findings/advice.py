@@ -30,7 +30,7 @@ OTHER |= {"quaternion_xyzw": "quaternion_wxyz", "quaternion_wxyz": "quaternion_x
 QUANTITIES = {"gyro": d.Rate, "accel": d.Acceleration, "velocity": d.Speeds, "depth": d.Height, "heading": d.Angle}
 USUAL = {"gyro": "rad/s", "accel": "m/s^2", "velocity": "m/s", "depth": "m", "heading": "rad"}
 """The unit that a fix of another unit is relative to, or the other way round."""
-WORDS = re.compile(r": (mirror|exchange) ")
+WORDS = re.compile(r": (mirror|exchange|raise) ")
 """Fixes that stand for keys which only the description tells."""
 IN_FILE = {
     "frame": "x is east, y north and z up; from north, east and down exchange x and y, and negate z",
@@ -39,8 +39,11 @@ IN_FILE = {
     "mirror longitude": "negate x, which is east",
     "attitude.form": "a quaternion is x, y, z, w, in this order",
     "exchange": "exchange x and y",
+    "raise": "take the difference from z, which is up",
 }
 """What to do in a truth's own file, by a word of the fix."""
+DEPTH_OFFSET = "streams.depth.depth.offset: {:.3f}  # positive: down; with up {:.3f}"
+"""By how much depths are to grow, and heights therefore, m."""
 ATTITUDE = "streams.heading.attitude: check form, axes and world, the unit of angles, and the order of the columns"
 """Instead of the keys of a heading."""
 Raw = dict[str, Any]
@@ -148,6 +151,8 @@ def _changes(line: str, raw: Raw) -> Changes:
         return _exchanged(path, raw)
     if text.startswith("mirror "):
         return _mirrored(path, text, raw)
+    if text.startswith("raise "):
+        return _raised(path, float(text.split()[1]), raw)
     value = yaml.safe_load(text)
     if "whichever" in remark:
         return {path: OTHER[_at(raw, path) or DEFAULTS[key]]}
@@ -187,6 +192,24 @@ def _mirrored(path: str, text: str, raw: Raw) -> Changes:
     frame = _at(raw, f"{path}.frame") or DEFAULTS["frame"]
     axes = {"ENU": [east, north, 1], "NED": [north, east, 1]}[frame]
     return _scaled(f"{path}.position.scale", axes, raw)
+
+
+def _raised(path: str, up_m: float, raw: Raw) -> Changes:
+    """Add to the heights of GPS or truth, in whichever key they are.
+
+    Raises:
+        ValueError: no key of the description is a height.
+    """
+    there = _at(raw, path) or {}
+    if there.get("height_m") is not None:
+        return {f"{path}.height_m": _short(there["height_m"] + up_m)}
+    if "position" in there and there.get("frame") != "ECEF":
+        by = up_m / d.Lengths.units[there["position"]["unit"]]
+        return _added(f"{path}.position.offset", [0.0, 0.0, -by if there.get("frame") == "NED" else by], raw)
+    altitude = f"{path}.geodetic.altitude"
+    if _at(raw, altitude) is None:
+        raise ValueError(path)
+    return _added(f"{altitude}.offset", up_m / d.Height.units[_at(raw, f"{altitude}.unit")], raw)
 
 
 def _scaled(path: str, value: Any, raw: Raw) -> Changes:

@@ -16,6 +16,7 @@ from ..findings.finding import Check, Finding
 from ..streams.norms import NO_GRAVITY, check_norms
 from .attitudes import attitude_findings, random_heading
 from .axes import CLEARLY, SURELY, agreement, axes_findings, best, hypotheses, is_upright, scale_findings
+from .datum import height_findings, surface_findings
 from .plane import heading_fits, heard_under_water, plane_findings
 from .readings import reading_findings, without
 from .relations import tilting, turning
@@ -46,7 +47,9 @@ def quick_findings(log: Log) -> tuple[Finding, ...]:
         return tuple(readings)
     coarse = replace(log, imu=ImuStream(_times(sketch), sketch.w_I, sketch.f_I))
     single = check_norms(coarse).findings
-    return (*readings, *single, *unsaid(single, gross_check(log, sketch).findings))
+    gross = unsaid(single, gross_check(log, sketch).findings)
+    faulty = {finding.stream for finding in gross}
+    return (*readings, *single, *gross, *height_findings(replace(sketch, log=without(log, faulty))))
 
 
 def gross_check(log: Log, sketch: Sketch | None = None) -> Check:
@@ -104,9 +107,11 @@ def _findings(sketch: Sketch) -> list[Finding]:
     in_plane, agrees = plane_findings(sketch, turns_right)
     suspects = {finding.stream for finding in in_plane}
     vouched = {"dvl"} if agrees else set()
-    vertical = vertical_findings(sketch, suspects, vouched)
+    zero = [] if "gps" in suspects else surface_findings(sketch)
+    vertical = vertical_findings(sketch, suspects, vouched, zero_off=bool(zero))
     if not in_plane and all(finding.stream == "dvl" for finding in vertical):
         vertical = _imu_yaw(sketch, agrees) or vertical  # it turns the climb over too
+    vertical += [] if any(finding.stream == "depth" for finding in vertical) else zero
     every = [*in_plane, *vertical]
     if not {"gps", "depth"} & {finding.stream for finding in every}:
         every += heard_under_water(sketch)

@@ -9,10 +9,11 @@ import numpy as np
 from ....datasets.described.description import Height
 from ....datasets.log import Log
 from ....datasets.state import Array
-from ..findings.advice import clock_fix, late_or_early
+from ..findings.advice import DEPTH_OFFSET, clock_fix, late_or_early
 from ..findings.finding import Finding
 from ..findings.fitting import Mask
 from ..streams.channels import seconds
+from .datum import in_the_air_m
 from .shifts import Shift, shift_of
 from .sketch import Sketch
 
@@ -78,12 +79,13 @@ def _slope(sketch: Sketch, one: tuple[Array, Mask], other: tuple[Array, Mask]) -
     return Slope(value, c, shift)
 
 
-def vertical_findings(sketch: Sketch, suspects: set[str], vouched: set[str]) -> list[Finding]:
+def vertical_findings(sketch: Sketch, suspects: set[str], vouched: set[str], zero_off: bool = False) -> list[Finding]:
     """Compare every height with every other, and say which one is turned over, scaled or late.
 
     Args:
         suspects: streams that are known to be wrong, and are left out.
         vouched: streams that are known to be right.
+        zero_off: whether the zero of the depth sensor is known to be off: it is then no wonder that it is in the air.
     """
     heights, log = {name: z for name, z in _heights(sketch).items() if name not in suspects}, sketch.log
     pairs = {
@@ -93,12 +95,14 @@ def vertical_findings(sketch: Sketch, suspects: set[str], vouched: set[str]) -> 
     }
     wrong = {pair for pair, slope in pairs.items() if _is_wrong(slope)}
     right = {pair for pair, slope in pairs.items() if abs(slope.correlation) > ALIKE} - wrong
-    above = "depth" in heights and _in_the_air(log)
+    above = "depth" in heights and _in_the_air(log) and not zero_off
     turned = any(
         pairs[pair].value < 0 and abs(pairs[pair].correlation) > ALIKE for pair in wrong
     )  # of which a path in the plane knows nothing
     vouched = {name for pair in right for name in pair} | (set() if turned else vouched)
     culprits = {name for pair in wrong for name in pair} - vouched
+    if right == {("depth", "dvl")} and not zero_off and in_the_air_m(log):
+        return [_too_high(log)]
     if above and "depth" not in vouched:
         culprits = {"depth"}
     elif "depth" in culprits and len(culprits) > 1 and log.depth is not None:
@@ -157,6 +161,15 @@ def _turned(log: Log, name: str, how: str) -> Finding:
         "truth": "",
     }
     return Finding(name, f"The {_words(log, name)} {how}: up and down are exchanged.", fixes[name])
+
+
+def _too_high(log: Log) -> Finding:
+    """Return what is wrong with a depth sensor that climbs rightly, in the air."""
+    z_m = in_the_air_m(log)
+    message = (
+        f"The depth sensor climbs as the others do, and reads up to {z_m:.2f} m above the surface: its zero is off"
+    )
+    return Finding("depth", message + ", by at least so much.", DEPTH_OFFSET.format(z_m, -z_m))
 
 
 def _finding(log: Log, name: str, other: str, slope: Slope) -> Finding:

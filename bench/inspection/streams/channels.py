@@ -85,6 +85,12 @@ def imu_period_ns(imu: ImuStream) -> int:
 
 
 @lru_cache(maxsize=1)
+def imu_start_ns(imu: ImuStream) -> int:
+    """Return the start of an IMU's first interval, ns; the checks ask for it hundreds of times."""
+    return imu.start_ns
+
+
+@lru_cache(maxsize=1)
 def channels_of(log: Log) -> tuple[Channel, ...]:
     """Return the channels of every stream that is there: gyro, accel, dvl, depth, gps, heading."""
     noise, root_s = log.rig.imu_noise, float(np.sqrt(imu_period_ns(log.imu) * 1e-9))
@@ -118,4 +124,5 @@ def _turned(stream: AttitudeStream) -> Array:
 
 def seconds(log: Log, t_ns: TimeArray) -> Array:
     """Return times from the log's start, s."""
-    return np.asarray((t_ns - log.start_ns) * 1e-9, dtype=np.float64)
+    start_ns = imu_start_ns(log.imu) if log.prior is None else log.prior.t_ns
+    return np.asarray((t_ns - start_ns) * 1e-9, dtype=np.float64)

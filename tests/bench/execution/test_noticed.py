@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from fathom.bench import run_log
-from fathom.bench.execution.noticed import late_readings, noticed
+from fathom.bench.execution.noticed import late_readings, noticed, unmeasured_height
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.log import Log
 from fathom.datasets.notes import Note, as_data
@@ -79,3 +79,17 @@ def test_late_readings_are_the_same_number_for_a_filter_and_a_smoother() -> None
     assert expected > 10
     assert [result.counts["readings_late"] for result in results] == [expected] * 4
     assert [result.counts.get("late", 0) for result in results[:2]] == [0, expected]
+
+
+def test_a_height_that_nothing_measures_is_told_with_counts() -> None:
+    log = dive()
+    assert log.gps is not None
+    assert unmeasured_height(log, log.streams) == ()
+    assert unmeasured_height(log, {"dvl", "gps"}) == ()  # the fixes have one
+    level = replace(log.gps, sigma=log.gps.sigma * [1.0, 1.0, np.inf])
+    (note,) = unmeasured_height(replace(log, gps=level, depth=None), {"depth", "gps", "dvl"})
+    n = len(log.gps)
+    assert (note.kind, note.stream, note.count, note.of) == ("height", "gps", n, n)
+    assert f"no depth, and {n} of {n} fixes without a height" in note
+    assert "no fix" in unmeasured_height(log, {"dvl"})[0]
+    assert unmeasured_height(replace(log, truth=None), {"dvl"}) == ()

@@ -316,12 +316,13 @@ def test_the_declination_of_lauv_is_found(tmp_path: Path, recorded_data: Path) -
 def test_the_offset_of_lauvs_reference_height_is_found(tmp_path: Path, recorded_data: Path) -> None:
     z = {"truth.position": {"columns": ["x", "y", "z"], "unit": "m"}}
     log = naive(tmp_path, recorded_data, LAUV, z)
-    (finding,) = (f for f in findings(log) if f.fix.startswith("truth.position.offset"))
+    description = read_description(tmp_path / "naive.yaml")
+    (finding,) = (resolved(f, description) for f in findings(log) if f.fix.startswith("truth: raise"))
     assert "reference" in finding.message
     offset = yaml.safe_load(finding.fix.split(": ", 1)[1].split("#")[0])
     np.testing.assert_allclose(offset, [0, 0, 57.547], atol=0.001)
     log = naive(tmp_path, recorded_data, LAUV, {**z, "truth.position.offset": offset})
-    assert not [f for f in findings(log) if "position.offset" in f.fix]
+    assert not [f for f in findings(log) if "raise" in f.fix]
 
 
 def test_lauvs_reference_does_not_climb_as_it_says(tmp_path: Path, recorded_data: Path) -> None:

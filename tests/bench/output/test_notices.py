@@ -138,3 +138,10 @@ def test_a_printed_table_has_a_sentence_for_each_kind() -> None:
         "damage: a.bag: cut off 12 bytes before a record's end",
         "left out on reading: dvl 49 of 500 (9.8 %)",
     ]
+
+
+def test_a_sentence_of_one_estimator_names_it() -> None:
+    height = Note("nothing measures the height", "height", "gps", 9, 9)
+    assert lines(row("dive", "eskf", height), row("dive", "fls")) == [
+        "dive: height (eskf): nothing measures the height"
+    ]

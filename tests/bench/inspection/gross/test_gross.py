@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from fathom.bench.inspection.findings.advice import in_words, put, resolved
+from fathom.bench.inspection.findings.advice import in_words, put, resolve, resolved
 from fathom.bench.inspection.findings.finding import Finding
 from fathom.bench.inspection.gross.gross import gross_check, quick_findings
 from fathom.bench.inspection.gross.readings import reading_findings
@@ -63,6 +63,17 @@ def stream(name: str, scale: Any = 1.0, late_s: float = 0.0, order: Any = slice(
     return of
 
 
+def raised(name: str, up_m: float) -> Callable[[Log], Log]:
+    """The heights of a sensor moved up."""
+
+    def of(log: Log) -> Log:
+        up = np.array([0.0, 0.0, up_m])
+        old: ReadingStream = getattr(log, name)
+        return replace(log, **{name: type(old)(old.t_ns, old.received_ns, old.z + up[-old.width :], old.sigma)})
+
+    return of
+
+
 def turned(name: str, degrees: float) -> Callable[[Log], Log]:
     """A DVL, or a heading sensor, turned counter-clockwise."""
 
@@ -97,6 +108,8 @@ def without(*names: str) -> Callable[[Log], Log]:
     return lambda log: replace(log, **dict.fromkeys(names))
 
 
+PLACE = {"latitude": 1, "longitude": 2}
+ALTITUDE = {"columns": [3], "unit": "m", "offset": 2}
 FAULTS: dict[str, tuple[tuple[Callable[[Log], Log], ...], str, str]] = {
     # what is done to a right log, the stream blamed, and words of the finding
     "accelerometer in g": ((imu(accel=1 / 9.80665),), "imu", "it is in g"),
@@ -142,6 +155,15 @@ FAULTS: dict[str, tuple[tuple[Callable[[Log], Log], ...], str, str]] = {
     "depth in mm": ((stream("depth", 1000.0),), "depth", "ratio of mm"),
     "depth in bar": ((stream("depth", 0.1),), "depth", "ratio of bar"),
     "depth late": ((stream("depth", late_s=18.0),), "depth", "s late"),
+    "depth with the atmosphere in it": ((raised("depth", -10.2),), "depth", "pressure of the atmosphere"),
+    "depth without truth": (
+        (raised("depth", 4.0), without("truth")),
+        "depth",
+        "m above the sea surface where the GPS",
+    ),
+    "depth by the truth": ((raised("depth", -10.0), without("gps")), "depth", "atmosphere is in its depths"),
+    "depth in the air": ((raised("depth", 5.0), without("gps", "truth")), "depth", "m above the surface: its zero is"),
+    "GPS heights": ((raised("gps", 50.0),), "gps", "above the ellipsoid"),
     "depth's sigma": ((sigma("depth", 1e-3),), "depth", "times the stated sigma"),
     "heading's sigma": ((sigma("heading", 1e4),), "heading", "no sensor's"),
 }
@@ -185,7 +207,7 @@ def test_a_gross_fault_is_found_and_its_advice_mends_it(what: str, tmp_path: Pat
     assert found_in(folder) == ()
 
 
-@pytest.mark.parametrize("what", ["left-handed y", "GPS early", "depth turned over"])
+@pytest.mark.parametrize("what", ["left-handed y", "GPS early", "depth turned over", "depth with the atmosphere in it"])
 def test_inspect_says_it_too_and_blames_no_other_stream(what: str, tmp_path: Path) -> None:
     _, blamed, words = FAULTS[what]
     folder = write_folder(marred(what), tmp_path / "log")
@@ -204,6 +226,11 @@ TRUTH: dict[str, tuple[Callable[[Array], Array], float, str]] = {
     "early": (lambda p: p, -2.0, "2.0 s early"),
     "west for east": (lambda p: p * [-1, 1, 1], 0.0, "hemisphere W"),
     "NED": (lambda p: p[:, [1, 0, 2]] * [1, 1, -1], 0.0, "east and north are exchanged"),
+    "too high": (
+        lambda p: p + np.array([0, 0, 30]),
+        0.0,
+        "+30.00 m (median) against the depth sensor's throughout, which is at the",
+    ),
     "upside down": (lambda p: p * [1, 1, -1], 0.0, "up and down are exchanged"),
 }
 
@@ -234,6 +261,53 @@ def geodetic(folder: Path, log: Log, **columns: Any) -> Path:
     raw["streams"]["gps"]["geodetic"] = {"latitude": "lat", "longitude": "lon"} | columns
     (folder / "log.yaml").write_text(yaml.safe_dump(raw))
     return folder
+
+
+def test_a_height_whose_zero_nothing_tells_is_told_and_not_guessed() -> None:
+    log = without("gps")(sail())
+    (finding,) = quick_findings(raised("depth", -4.0)(log))
+    assert (finding.stream, finding.fix) == ("truth", "")
+    assert "nothing tells which" in finding.message
+
+
+def test_fixes_of_an_acoustic_system_do_not_show_the_surface() -> None:
+    """They are heard at any depth, and at a constant one they are told apart in words."""
+    log = without("truth")(sail())
+    assert log.truth is None
+    assert log.gps is not None
+    assert log.depth is not None
+    truth = sail().truth
+    assert truth is not None
+    p = truth.p_WB_W[::10]
+    everywhere = type(log.gps)(
+        truth.t_ns[::10], truth.t_ns[::10], p, np.broadcast_to([1.5, 1.5, np.inf], p.shape).copy()
+    )
+    assert quick_findings(replace(log, gps=everywhere)) == ()
+    z = np.full_like(log.depth.z, -5.0) + 0.01 * np.random.default_rng(1).standard_normal(log.depth.z.shape)
+    level = type(log.depth)(log.depth.t_ns, log.depth.received_ns, z, log.depth.sigma)
+    (finding,) = quick_findings(replace(log, gps=everywhere, depth=level, dvl=None))
+    assert "acoustic" in finding.hint
+
+
+@pytest.mark.parametrize(
+    ("path", "there", "line"),
+    [
+        ("truth", {"geodetic": PLACE, "height_m": -0.15}, "truth.height_m: 9.85"),
+        (
+            "truth",
+            {"frame": "NED", "position": {"columns": [1, 2, 3], "unit": "cm"}},
+            "truth.position.offset: [0, 0, -1000]",
+        ),
+        ("truth", {"geodetic": {**PLACE, "altitude": ALTITUDE}}, "truth.geodetic.altitude.offset: 12"),
+        ("truth", {"frame": "ECEF", "position": {"columns": [1, 2, 3], "unit": "m"}}, None),
+    ],
+)
+def test_a_height_is_raised_in_the_key_that_states_it(
+    path: str, there: dict[str, Any], line: str | None, tmp_path: Path
+) -> None:
+    raw = yaml.safe_load((write_folder(sail(), tmp_path / "log") / "log.yaml").read_text())
+    put(raw, path, {"table": {"file": "x.csv"}, "time": {"column": "t"}, **there})
+    assert resolve(f"{path}: raise 10.0", raw) == (None if line is None else [line])
 
 
 def test_latitude_and_longitude_that_are_exchanged_are_found(tmp_path: Path) -> None:
