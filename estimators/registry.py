@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
@@ -68,7 +70,7 @@ def load_estimator(name: str) -> Any:
     known = known_estimators()
     if name not in known:
         raise EstimatorError(f"no estimator {name!r}{nearest(name, known)} (known: {', '.join(known)})")
-    makers = ["fathom"] * (name in ESTIMATORS) + sorted(map(_package, entry_points(group=GROUP, name=name)))
+    makers = ["fathom"] * (name in ESTIMATORS) + sorted(map(_package, _points(tuple(sys.path)).select(name=name)))
     if len(makers) > 1:
         raise EstimatorError(
             f"{name}: several packages bring an estimator of this name ({', '.join(makers)}); rename or uninstall one"
@@ -84,7 +86,13 @@ def load_estimator(name: str) -> Any:
 
 
 def _plugins() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=GROUP)}
+    return {point.name: point for point in _points(tuple(sys.path))}
+
+
+@cache
+def _points(path: tuple[str, ...]) -> EntryPoints:
+    """Return the entry points of what is installed on a search path: reading them costs as much as a short run."""
+    return entry_points(group=GROUP)
 
 
 def _package(point: EntryPoint) -> str:

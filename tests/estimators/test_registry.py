@@ -8,13 +8,14 @@ import signal
 import sys
 import warnings
 from dataclasses import FrozenInstanceError
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from fathom.estimators import ESTIMATORS, Estimator, create
-from fathom.estimators.registry import EstimatorError, known_estimators, load_estimator
+from fathom.estimators import ESTIMATORS, Estimator, create, registry
+from fathom.estimators.registry import EstimatorError, known_estimators, load_estimator, package_of
 from packages import distribution
 
 
@@ -65,6 +66,24 @@ def test_a_broken_package_is_named_and_spoils_no_other(tmp_path: Path, monkeypat
         create("wreck")
     with pytest.raises(EstimatorError, match="no estimator 'eskff'"):
         create("eskff")
+
+
+def test_what_is_installed_is_read_once_however_many_estimators_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def counted(group: str) -> Any:
+        asked.append(group)
+        return entry_points(group=group)
+
+    monkeypatch.setattr(registry, "entry_points", counted)
+    distribution(tmp_path, "sounds", "[fathom.estimators]\nsound = sound:Sound\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for _ in range(3):
+        create("eskf")
+        assert package_of("sound") == "sounds 1.0"
+    assert asked == ["fathom.estimators"]
 
 
 PLAIN = """
