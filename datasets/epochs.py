@@ -27,6 +27,8 @@ IMU_SAMPLE = np.dtype(
         ("period_s", "f8"),  # sampling period of the IMU, also where a sample was split
         ("w_WI_I", "f8", (3,)),
         ("f_I", "f8", (3,)),
+        ("alpha_I", "f8", (3,)),  # rad/s²: how w_WI_I changes, by this sample and the one before it; 0 without one
+        ("after_s", "f8"),  # how long after the middle of the sample the row ends; 0 in a gap
     ]
 )
 READING = np.dtype([("kind", "i8"), ("t_ns", "i8"), ("received_ns", "i8"), ("z", "f8", (9,)), ("sigma", "f8", (3,))])
@@ -170,6 +172,9 @@ def _imu_table(
 
     In a gap the sample before is held, up to one period before the next one, so that no row uses a later sample.
     """
+    middle = log.imu.t_ns - (interval - gap) // 2
+    alpha_I = np.zeros_like(log.imu.w_WI_I)
+    alpha_I[1:] = np.diff(log.imu.w_WI_I, axis=0) / (np.diff(middle) * 1e-9)[:, None]
     imu, is_gap = log.imu, gap > 0
     held_until = imu.t_ns - interval + gap
     edges = np.union1d(times, held_until[is_gap])
@@ -186,6 +191,8 @@ def _imu_table(
     table["t_ns"], table["period_s"] = t_ns, imu.period_ns * 1e-9
     table["dt_s"] = np.diff(t_ns, prepend=start_ns) * 1e-9
     table["held_s"] = np.where(held, _held_s(gap)[source], 0.0)
+    table["alpha_I"][~held] = alpha_I[source[~held]]
+    table["after_s"][~held] = (t_ns - middle[source])[~held] * 1e-9
     source = np.where(held, np.maximum(source - 1, 0), source)
     table["w_WI_I"], table["f_I"] = imu.w_WI_I[source], imu.f_I[source]
     return table

@@ -24,7 +24,7 @@ from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOC
 from ..interface import Diverged, unknown_kind
 from ..physics.blocks import TOP, identity, rows_times, set_block
 from ..physics.dvl_preintegration import given_rotation
-from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, unbiased
+from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, rate_at_end, unbiased
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import (
     cross_into,
@@ -81,15 +81,19 @@ def equivalent_samples(
     rate_arm, lever, step, reached, lacking = vectors[6], vectors[7], vectors[8], vectors[9], vectors[10]
     R, R_last, turn, J = matrices[0], matrices[1], matrices[2], matrices[3]
     identity(R)
+    rate_at_end(before[0], rates[0], g.R_BI[:], reached)
+    cross_into(reached, g.p_BI_B[:], rate_arm)
     for k in range(n):
         dt = dts[k + 1]
         increments(rates, forces, dts, k, phi, push, drift)
         exp_into(phi, turn)
-        cross_into(rates[k + 1], g.p_BI_B[:], rate_arm)
-        transform_into(turn, rate_arm, lever)
-        cross_into(rates[k], g.p_BI_B[:], rate_arm)
         for i in range(3):
-            push[i] += rate_arm[i] - lever[i]
+            push[i] += rate_arm[i]
+        rate_at_end(imu[k], rates[k + 1], g.R_BI[:], reached)
+        cross_into(reached, g.p_BI_B[:], rate_arm)
+        transform_into(turn, rate_arm, lever)
+        for i in range(3):
+            push[i] -= lever[i]
             for j in range(3):
                 R_last[i, j] = R[i, j]
         product_into(R_last, turn, R)

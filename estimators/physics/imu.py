@@ -8,10 +8,10 @@ and sculling corrections, and moves it to B at the two ends:
     Δv_B = Δv_I + ω_i × l − ΔR (ω_j × l)        Δp_B = Δp_I + (ω_i × l) T + l − ΔR l
 
 Term by term this is what the centripetal and the tangential acceleration of I add up to, the gyro being differenced
-for the latter: the difference telescopes, so only the rates ω_i and ω_j at the ends are left. Each is the mean over the
-last sample before its moment, so v_B lags by half a sample's turn of l, which does not accumulate.
+for the latter: the difference telescopes, so only the rates ω_i and ω_j at the ends are left. A sample is a mean, half
+of it late, so its rate is run straight on to its end by the sample before it (`rate_at_end`).
 
-Nor does their noise, one gyro sample each: ω_i's leaves with the block what it came with, as part of v_B at i, and
+The noise of these rates does not accumulate: ω_i's leaves with the block what it came with, as part of v_B at i, and
 ω_j's is fresh. A covariance that took both as process noise would grow with every block, however short. So neither is
 in N: P is of v_B but for the rate noise of the moment, `rate_cov`, which is added where v_B is compared with a reading
 of it and where a belief is handed out. (A single block's Δv, taken alone, has it twice.)
@@ -62,6 +62,9 @@ HELD_RATE = 0.1
 """rad/s: how far the rate may stray, for the whole of a gap, from the sample that is held over it."""
 HELD_ACCEL = 0.5
 """m/s²: the same for the specific force."""
+
+RATE_NOISE = 1.5**2 + 0.5**2
+"""Variance of the rate at a sample's end, 1½ of it less ½ of the one before, over that of one sample."""
 
 RIG = np.dtype(
     [
@@ -165,8 +168,10 @@ def integrate(
         product_into(R_mid[k], half, R)
         T += dt
 
-    cross_into(rates[0], g.p_BI_B[:], c_i)
-    cross_into(rates[n], g.p_BI_B[:], c_j)
+    rate_at_end(before[0], rates[0], g.R_BI[:], drift)
+    cross_into(drift, g.p_BI_B[:], c_i)
+    rate_at_end(imu[n - 1] if n else before[0], rates[n], g.R_BI[:], drift)
+    cross_into(drift, g.p_BI_B[:], c_j)
     block.T = T
     for i in range(3):  # from I to B: v and p are now of the block's end
         for j in range(3):
@@ -195,6 +200,15 @@ def unbiased(
                 rates[k, i] += R_BI[i, j] * (row.w_WI_I[j] - b_g[j])
                 forces[k, i] += R_BI[i, j] * (row.f_I[j] - b_a[j])
     return rates, forces, dts
+
+
+@inner
+def rate_at_end(row: Any, rate: Array, R_BI: Array, out: Array) -> None:
+    """Fill out (3,) with the rate at the end of a sample whose mean is `rate`, rad/s in B; docs/conventions.md (24)."""
+    for i in range(3):
+        out[i] = rate[i]
+        for j in range(3):
+            out[i] += R_BI[i, j] * row.alpha_I[j] * row.after_s
 
 
 @compiled
@@ -523,7 +537,7 @@ def first_sample(imu: NDArray[Any], rig: NDArray[Any]) -> NDArray[Any]:
         return np.zeros(1, IMU_SAMPLE)
     if rig["p_BI_B"].any():
         L = skew(rig["p_BI_B"][0])
-        rig["rate_cov"] = rig["gyro_density"][0] ** 2 / imu["period_s"][0] * (L @ L.T)
+        rig["rate_cov"] = RATE_NOISE * rig["gyro_density"][0] ** 2 / imu["period_s"][0] * (L @ L.T)
     row = imu[:1].copy()
     if len(imu) > 1:
         for name in ("w_WI_I", "f_I"):
@@ -541,4 +555,5 @@ def split(imu: NDArray[Any], t_ns: int) -> tuple[NDArray[Any], NDArray[Any]]:
             head, tail = np.concatenate([head, tail[:1]]), tail.copy()
             head["dt_s"][-1], tail["dt_s"][0] = (t_ns - began_ns) * 1e-9, (int(tail["t_ns"][0]) - t_ns) * 1e-9
             head["t_ns"][-1] = t_ns
+            head["after_s"][-1] -= tail["dt_s"][0]
     return head, tail

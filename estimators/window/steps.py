@@ -148,6 +148,7 @@ def split_samples(w: Records, imu: Records, first: int, t_ns: int) -> None:
             w[0].n_imu += 1
             imu[k].dt_s, imu[k].t_ns = (t_ns - began_ns) * 1e-9, t_ns
             imu[k + 1].dt_s = (imu[k + 1].t_ns - t_ns) * 1e-9
+            imu[k].after_s -= imu[k + 1].dt_s
 
 
 @inner
@@ -168,6 +169,7 @@ def move_along(
         if began_ns < t_ns:
             part = imu[first : end + 1].copy()
             part[end - first].dt_s, part[end - first].t_ns = (t_ns - began_ns) * 1e-9, t_ns
+            part[end - first].after_s -= (imu[end].t_ns - t_ns) * 1e-9
     integrate(part, imu[first - 1 : first], biases[0], biases[1], rig, block)
 
 

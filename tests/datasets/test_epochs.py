@@ -47,6 +47,22 @@ def test_splitting_keeps_the_integral_of_every_sample(log: Log) -> None:
     assert np.allclose(turned, log.imu.w_WI_I.sum(axis=0) * period_s, rtol=1e-9)
 
 
+def test_a_row_knows_the_rate_where_it_ends(log: Log) -> None:
+    """A rate that changes evenly: exact at the end of every row, split or not, and after a gap; held over the gap."""
+    t_s = (log.imu.t_ns - log.start_ns) * 1e-9
+    a, b = np.array([0.1, -0.2, 0.3]), np.array([0.05, 0.02, -0.07])
+    means = a + b * (t_s - 0.5e-9 * log.imu.period_ns)[:, None]
+    gapped = with_gap(replace(log, imu=ImuStream(log.imu.t_ns, means, log.imu.f_I)), 10.0, 10.4)
+    rows = np.concatenate([epoch.imu for epoch in cut(gapped).epochs])
+    ends_s, held = (rows["t_ns"] - log.start_ns) * 1e-9, rows["held_s"] > 0
+    at_end = rows["w_WI_I"] + rows["alpha_I"] * rows["after_s"][:, None]
+    own = ~held & (ends_s > t_s[0])  # the first sample has none before it
+    assert held.any()
+    assert (rows["dt_s"][own] < 0.9e-9 * log.imu.period_ns).any()
+    np.testing.assert_allclose(at_end[own], (a + b * ends_s[:, None])[own], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(at_end[held], rows["w_WI_I"][held])
+
+
 def test_every_reading_comes_once_in_the_order_of_reception(log: Log) -> None:
     voyage = cut(log)
     received = np.concatenate([epoch.readings["received_ns"] for epoch in voyage.epochs])

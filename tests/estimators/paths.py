@@ -81,6 +81,7 @@ class Path:
     def imu(self, t_end_s: np.ndarray, dt_s: float, rig: Rig, b_a: np.ndarray, b_g: np.ndarray) -> np.ndarray:
         """IMU_SAMPLE rows: means over the intervals, by Gauss–Legendre quadrature of the IMU's own path."""
         nodes, weights = np.polynomial.legendre.leggauss(4)
+        t_end_s = np.r_[t_end_s[0] - dt_s, t_end_s]  # the sample before the first, by which its rate changes
         rows = np.zeros(len(t_end_s), IMU_SAMPLE)
         rows["t_ns"], rows["dt_s"], rows["period_s"] = np.round(t_end_s * 1e9), dt_s, dt_s
         g_W = np.array([0, 0, -rig.gravity])
@@ -92,7 +93,8 @@ class Path:
             rows["f_I"] += 0.5 * weight * np.einsum("nji,nj->ni", R_WI, f_W)
         rows["w_WI_I"] += b_g
         rows["f_I"] += b_a
-        return rows
+        rows["alpha_I"][1:], rows["after_s"] = np.diff(rows["w_WI_I"], axis=0) / dt_s, 0.5 * dt_s
+        return rows[1:].copy()
 
 
 def reading(kind: int, z: np.ndarray, sigma: np.ndarray, t_ns: int = 0) -> np.ndarray:

@@ -54,6 +54,7 @@ def samples(rng: np.random.Generator, n: int) -> NDArray[Any]:
     table["dt_s"] = np.diff(table["t_ns"], prepend=0) * 1e-9
     table["period_s"], table["held_s"][3:6] = 0.01, 0.03
     table["w_WI_I"], table["f_I"] = rng.normal(size=(n, 3)), 5 * rng.normal(size=(n, 3))
+    table["alpha_I"], table["after_s"] = rng.normal(size=(n, 3)), rng.uniform(-0.1, 0.1, n)
     return table
 
 
@@ -73,6 +74,7 @@ def test_the_imu_block_is_that_of_the_page(seed: int) -> None:
 
     w = [R_BI @ (row["w_WI_I"] - b_g) for row in (*before, *rows)]  # (21)
     f = [R_BI @ (row["f_I"] - b_a) for row in (*before, *rows)]
+    w_i, w_j = (R_BI @ (row["w_WI_I"] + row["after_s"] * row["alpha_I"] - b_g) for row in (before[0], rows[-1]))
     dts = [*before["dt_s"], *rows["dt_s"]]
     R, v, p, T, middles = I3, np.zeros(3), np.zeros(3), 0.0, []
     for k in range(1, len(dts)):
@@ -85,13 +87,13 @@ def test_the_imu_block_is_that_of_the_page(seed: int) -> None:
         drift = dt**2 / 2 * f[k] + dt**3 / 6 * w_x_f + dt**4 / 24 * x(w[k], w_x_f)
         middles.append((T + dt / 2, R @ exp(turn / 2), v + R @ push / 2, p + dt / 2 * v + R @ drift / 4, dt))
         p, v, R, T = p + dt * v + R @ drift, v + R @ push, R @ exp(turn), T + dt  # (23)
-    dv = v + np.cross(w[0], arm) - R @ np.cross(w[-1], arm)  # (24)
-    dp = p + np.cross(w[0], arm) * T + arm - R @ arm
+    dv = v + np.cross(w_i, arm) - R @ np.cross(w_j, arm)  # (24)
+    dp = p + np.cross(w_i, arm) * T + arm - R @ arm
     b = block[0]
     for name, value in (("dR", R), ("dv", dv), ("dp", dp)):
         np.testing.assert_allclose(b[name], value, rtol=0, atol=1e-12)
 
-    v_end, p_end, N = v - R @ np.cross(w[-1], arm), p - R @ arm, np.zeros((9, 9))
+    v_end, p_end, N = v - R @ np.cross(w_j, arm), p - R @ arm, np.zeros((9, 9))
     R_bg, v_ba, p_ba, v_bg, p_bg = np.zeros((5, 3, 3))
     for (t, R_s, v_s, p_s, dt), gap in zip(middles, rows["held_s"], strict=True):
         u_, w_ = v_end - v_s, p_end - p_s - v_s * (T - t)  # (29)

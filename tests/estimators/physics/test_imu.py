@@ -46,9 +46,7 @@ def test_block_follows_a_path_at_a_lever_arm(seed: int) -> None:
     b_a, b_g = rng.normal(size=3) * 0.05, rng.normal(size=3) * 0.01
     t = dt * np.arange(0, 1001)
     imu = path.imu(t, dt, rig, b_a, b_g)
-    state, truth = (
-        _with_late_rate(path.state(at, b_a, b_g), path, at, imu[k], rig) for at, k in ((0.0, 0), (10.0, -1))
-    )
+    state, truth = (_with_rate_of(path.state(at, b_a, b_g), path, at, imu[k], rig) for at, k in ((0.0, 0), (10.0, -1)))
     for k in range(1, 1001, 20):
         state = carry(state, imu[k : k + 20], imu[k - 1 : k], rig)
     error = truth.local(state)
@@ -57,10 +55,31 @@ def test_block_follows_a_path_at_a_lever_arm(seed: int) -> None:
     assert np.linalg.norm(error[6:9]) < 2e-5
 
 
-def _with_late_rate(state: NavState, path: Path, t_s: float, sample: np.ndarray, rig: Rig) -> NavState:
-    """The velocity of B by way of the IMU's, with the mean rate of the last sample: half a sample late, as we say."""
-    late = rig.imu.R_BS @ (sample["w_WI_I"] - state.b_g) - path.rate(np.array([t_s]))[0]
-    return replace(state, v_WB_W=state.v_WB_W - state.R_WB @ np.cross(late, rig.imu.p_BS_B))
+def _with_rate_of(state: NavState, path: Path, t_s: float, sample: np.ndarray, rig: Rig) -> NavState:
+    """The velocity of B by way of the IMU's, with the rate at the sample's end that is run straight on to it."""
+    rate_I = sample["w_WI_I"] + sample["alpha_I"] * sample["after_s"] - state.b_g
+    off = rig.imu.R_BS @ rate_I - path.rate(np.array([t_s]))[0]
+    return replace(state, v_WB_W=state.v_WB_W - state.R_WB @ np.cross(off, rig.imu.p_BS_B))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_lever_arm_turns_with_the_rate_where_the_block_ends(seed: int) -> None:
+    """At 20 Hz with 2 m, at the end of a sample and within one; the mean rate would be 10 to 30 mm/s off."""
+    rng, dt = np.random.default_rng(seed), 0.05
+    rig, path = random_rig(rng, lever_m=2.0), Path(seed)
+    imu = path.imu(dt * np.arange(0, 41), dt, rig, *np.zeros((2, 3)))
+    start, before = path.state(0.0, *np.zeros((2, 3))), imu[:1]
+    for end_s in (1.0, 1.013, 1.037, 2.0):
+        head, _ = split(imu[1:], round(end_s * 1e9))
+        late = head.copy()
+        late["after_s"] = 0.0
+        found, lagging = (
+            carry(start, rows, before, rig).v_WB_W - path.state(end_s, *np.zeros((2, 3))).v_WB_W
+            for rows in (head, late)
+        )
+        assert np.linalg.norm(found) < 5e-3
+        if end_s in (1.0, 2.0):
+            assert np.linalg.norm(found) < 0.25 * np.linalg.norm(lagging)
 
 
 @pytest.mark.parametrize("lever_m", [0.0, 1.0])
@@ -175,6 +194,7 @@ def test_covariance_of_a_chain_of_blocks_is_what_monte_carlo_finds(lever_m: floa
     for run in range(runs):
         noisy = imu.copy()
         noisy["w_WI_I"][1:] += rng.normal(size=(200, 3)) * noise.gyro_density / np.sqrt(dt)
+        noisy["alpha_I"][1:] = np.diff(noisy["w_WI_I"], axis=0) / dt
         noisy["f_I"] += rng.normal(size=(201, 3)) * noise.accel_density / np.sqrt(dt)
         errors[run] = clean.state.local(drive(noisy).state)[:9]
     claimed = clean.P[:9, :9]
