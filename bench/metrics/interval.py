@@ -38,7 +38,7 @@ BATCH = 500_000
 
 def interval(
     data: tuple[Array, ...],
-    statistic: Callable[..., Array],
+    statistic: Callable[..., Array | float],
     *,
     positive: bool = False,
     median: bool = False,
@@ -76,7 +76,7 @@ def interval(
     return (math.exp(low), math.exp(high)) if on_log else (low, high)
 
 
-def _percentiles(data: tuple[Array, ...], statistic: Callable[..., Array], level: float) -> tuple[float, float]:
+def _percentiles(data: tuple[Array, ...], statistic: Callable[..., Array | float], level: float) -> tuple[float, float]:
     if all(np.ptp(x) == 0.0 for x in data):  # all resamples are equal
         value = float(statistic(*data))
         return value, value

@@ -72,8 +72,10 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     differences = paired(every, plan.comparisons(), plan.compare)
     print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
     honest, converged = honesty(every), convergence(every)
-    over_logs = ([row for row in found if (row["log"], row["label"]) in shown] for found in (honest, converged))
-    print_over_logs(*over_logs, console)
+    honest_shown, converged_shown = (
+        [row for row in found if (row["log"], row["label"]) in shown] for found in (honest, converged)
+    )
+    print_over_logs(honest_shown, converged_shown, console)
     print_remarks(made, console)
     with writing(folder, "; the runs are in runs.sqlite"):
         write_table(every, folder / "table.csv")

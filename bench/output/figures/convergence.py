@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from itertools import takewhile
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ...drawing import WIDTH_IN, Look, empty_figure, legend_below, logarithmic, look_handle, narrow, plain, title_above
@@ -45,7 +46,7 @@ def draw_convergence(rows: Sequence[Record], looks: dict[str, Look]) -> Figure:
     panels[1].set_ylabel("ATE of these (m)")
     panels[2].set_ylabel(f"attitude of these: {NEES_OVER_DOF}")
     for axes in panels[1:]:
-        if any(math.isfinite(float(y)) for line in axes.lines for y in line.get_ydata()):
+        if any(np.isfinite(np.asarray(line.get_ydata(), float)).any() for line in axes.lines):
             logarithmic(axes, "y")
     panels[2].axhline(1, color="black", linewidth=0.4)
     for axes in panels:

@@ -89,7 +89,8 @@ def _draw(axes: Axes, by_log: dict[str, list[list[Record]]], block: str, looks: 
             line += 1
         axes.axhline(line, color="black", linewidth=0.3, alpha=0.4)
         line += 1
-    if axes.get_subplotspec().is_first_col():
+    place = axes.get_subplotspec()
+    if place is not None and place.is_first_col():
         axes.set_yticks(middles, [narrow(log, LETTERS) for log in by_log])
     else:
         axes.set_yticks([])
