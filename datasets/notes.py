@@ -11,6 +11,7 @@ KINDS = {
     "dropped": "rows were left out on reading",
     "repaired": "values were changed on reading",
     "start": "heading or velocity was unknown at the start, or the start was moved",
+    "earth": "whether the Earth turns, where the latitude is known",
     "gap": "gaps in the IMU were bridged",
     "outside": "readings lay outside the IMU's time",
     "late_dropped": "readings came too late to be used",

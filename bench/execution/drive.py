@@ -28,7 +28,7 @@ from ...estimators.physics.imu import compile_rig
 from ...estimators.physics.innovation import INNOVATION, innovations
 from ...estimators.registry import is_ours
 from ..results.identity import content_sha256
-from .noticed import ON_TIME_NS, late_readings, noticed
+from .noticed import ON_TIME_NS, late_readings, noticed, of_earth
 from .outputs import check_counts, check_form, check_smoothed, check_time, wrong_value
 from .result import Result, Status
 
@@ -222,7 +222,11 @@ def run_log(
         (end_ns - voyage.start_ns) * 1e-9,
         sum(len(epoch.imu) for epoch in driven),
         start,
-        (*notes, *noticed(log, counts)),
+        (
+            *notes,
+            *of_earth(log.rig, getattr(estimator, "earth_rotation", None) if ours else None),
+            *noticed(log, counts),
+        ),
         collector.table() if collector else None,
         ending.traceback,
     )

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from ...datasets.log import Log, ReadingStream
 from ...datasets.notes import Note
+from ...datasets.rig import Rig
 from ...estimators.interface import OUTLIERS
+from ...estimators.physics.imu import EarthRotation, turns_with_earth
 
 ON_TIME_NS = 1_000_000
 """A reading received at most this long after it was true came in time: 1 ms, in which 2 m/s is 2 mm."""
@@ -40,6 +42,14 @@ def noticed(log: Log, counts: Mapping[str, int]) -> tuple[Note, ...]:
         counts: of the run, see `Result.counts`.
     """
     return (*_of_streams(log), *_of_counts(log, counts))
+
+
+def of_earth(rig: Rig, earth_rotation: EarthRotation | None) -> tuple[Note, ...]:
+    """Return whether an estimator with this option (None: it has none) models the Earth's rotation, if it could."""
+    if rig.latitude_deg is None or earth_rotation is None:
+        return ()
+    said = "modelled" if turns_with_earth(rig, earth_rotation) else "left out (earth_rotation: false)"
+    return (Note(f"{said}, at latitude {rig.latitude_deg:.1f}°", "earth"),)
 
 
 def _of_streams(log: Log) -> Iterator[Note]:

@@ -62,3 +62,15 @@ def test_late_readings_are_the_same_number_for_a_filter_and_a_smoother() -> None
     assert expected > 10
     assert [result.counts["readings_late"] for result in results] == [expected] * 4
     assert [result.counts.get("late", 0) for result in results[:2]] == [0, expected]
+
+
+def test_a_run_says_whether_the_earth_turns_if_the_latitude_is_known() -> None:
+    still, turning = (simulate(Scenario(duration_s=20.0, latitude_deg=x), seed=1) for x in (None, -33.04))
+
+    def said(log: Log, **options: object) -> list[str]:
+        notes = run_log(log, create("eskf", **options)).notes
+        return [str(note) for note in notes if getattr(note, "kind", "") == "earth"]
+
+    assert said(still) == []
+    assert said(turning) == ["modelled, at latitude -33.0°"]
+    assert said(turning, earth_rotation=False) == ["left out (earth_rotation: false), at latitude -33.0°"]
