@@ -13,6 +13,7 @@ KINDS = {
     "start": "heading or velocity was unknown at the start, or the start was moved",
     "overclaims": "the estimator was started where it is known to claim more than it knows",
     "height": "nothing measures the height, and it is scored",
+    "earth": "whether the Earth turns, where the latitude is known",
     "gap": "gaps in the IMU were bridged",
     "outside": "readings lay outside the IMU's time",
     "late_dropped": "readings came too late to be used",

@@ -69,7 +69,8 @@ class Rig:
         imu_noise: its densities and bias figures.
         depth, gps, heading: mountings of the pressure sensor P, the GPS antenna G, the heading sensor H.
         gravity: m/s², positive; g_W = (0, 0, −gravity).
-        latitude_deg: of W's origin; None if unknown (or, in a simulation, if the Earth does not turn).
+        latitude_deg: of W's origin; None if unknown (or, in a simulation, if the Earth does not turn). By
+            default, estimators let the Earth turn where it is known.
     """
 
     imu_noise: ImuNoise
@@ -96,7 +97,7 @@ class Rig:
         if self.latitude_deg is None:
             raise DatasetError(
                 "rig: no latitude, so the Earth's rate in W is unknown; give `origin` in log.yaml, or `latitude_deg` "
-                "in a scenario, or leave `earth_rotation` out"
+                "in a scenario, or set `earth_rotation: auto`"
             )
         latitude = math.radians(self.latitude_deg)
         return EARTH_RATE_RAD_S * np.array([0.0, math.cos(latitude), math.sin(latitude)])

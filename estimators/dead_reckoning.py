@@ -15,7 +15,7 @@ from ..datasets.state import DIM, Array, Belief, NavState
 from ..datasets.trajectory import Trajectory
 from .interface import FACTORS, Factors, unknown_kind
 from .physics.dvl_preintegration import preintegrate_dvl
-from .physics.imu import compile_rig, over_world
+from .physics.imu import EarthRotation, compile_rig, over_world
 from .physics.so3 import exp
 from .stages import stage
 
@@ -30,12 +30,13 @@ class DeadReckoning:
         attitude: "gyro" integrates the rates from the prior's attitude (its bias removed); "heading" takes the yaw
             of the heading sensor, roll and pitch being level (or all three, from a sensor that gives them).
         factors: "heading" and "depth" may be left out; without "dvl" it stands still.
-        earth_rotation: with "gyro", subtract the Earth's rate from the gyro's; needs the rig's latitude.
+        earth_rotation: with "gyro", subtract the Earth's rate from the gyro's; "auto": if the rig knows its
+            latitude.
     """
 
     attitude: Literal["gyro", "heading"] = "heading"
     factors: Factors = FACTORS
-    earth_rotation: bool = False
+    earth_rotation: EarthRotation = "auto"
 
     def begin(self, prior: Belief, rig: Rig) -> DeadReckoningPass:
         """See `Estimator.begin`."""

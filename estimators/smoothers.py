@@ -12,6 +12,7 @@ from ..datasets.quantities import NotNegative, Positive, Whole
 from ..datasets.rig import Rig
 from ..datasets.state import Belief
 from .interface import FACTORS, Factors, Inflation, Pass
+from .physics.imu import EarthRotation
 from .robust import Losses
 
 DvlFactor = Literal["velocity", "preintegrated-loose", "preintegrated-tight"]
@@ -62,7 +63,7 @@ class GraphSmoother(ABC):
             the first guess, the IMU's prediction, has no weight until other readings move the estimate. So a vehicle
             whose error exceeds the width never uses that sensor again.
         smoothed_covariance_s: a smoothed state has its covariance once in this period; those between have none.
-        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
+        earth_rotation: W turns with the Earth (see `imu`); "auto": if the rig knows its latitude.
     """
 
     dvl: Annotated[frozenset[DvlFactor], Field(min_length=1), AfterValidator(_once)] = frozenset({"velocity"})
@@ -75,7 +76,7 @@ class GraphSmoother(ABC):
     inflate: Inflation = Field(default_factory=dict)
     robust: Losses = Field(default_factory=dict)
     smoothed_covariance_s: Positive = 5.0
-    earth_rotation: bool = False
+    earth_rotation: EarthRotation = "auto"
 
     @property
     @abstractmethod

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.log import Log, ReadingStream
 from ...datasets.notes import Note
+from ...datasets.rig import Rig
 from ...estimators.interface import OUTLIERS
+from ...estimators.physics.imu import turns_with_earth
 from ...estimators.unknown_start import yaw_sigma_rad
 
 ON_TIME_NS = 1_000_000
@@ -40,14 +43,23 @@ def noticed(log: Log, counts: Mapping[str, int], estimator: object = None) -> tu
     Args:
         log: what was driven through.
         counts: of the run, see `Result.counts`.
-        estimator: its configuration; one that states `honest_yaw_rad` is warned of by that.
+        estimator: its configuration; `honest_yaw_rad` and `earth_rotation` are told of, where it states them.
     """
-    return (*_of_start(log, estimator), *_of_streams(log), *_of_counts(log, counts))
+    of_estimator = (*_of_start(log, estimator), *_of_earth(log.rig, estimator))
+    return (*of_estimator, *_of_streams(log), *_of_counts(log, counts))
+
+
+def _stated(estimator: object, name: str) -> Any:
+    """Return an attribute; None where there is none, or another package's code raises instead."""
+    try:
+        return getattr(estimator, name, None)
+    except Exception:
+        return None
 
 
 def _of_start(log: Log, estimator: object) -> Iterator[Note]:
     """Yield where the heading at the start is known less well than the estimator needs to be honest."""
-    most_rad = getattr(estimator, "honest_yaw_rad", None)
+    most_rad = _stated(estimator, "honest_yaw_rad")
     if log.prior is not None and isinstance(most_rad, float) and (sigma_rad := yaw_sigma_rad(log.prior)) > most_rad:
         known, most = (f"{math.degrees(angle):.0f}°" for angle in (sigma_rad, most_rad))
         yield Note(f"the heading at the start has a sigma of {known}, and it is honest up to {most}", "overclaims")
@@ -65,6 +77,14 @@ def unmeasured_height(log: Log, sensors: Collection[str]) -> tuple[Note, ...]:
     fixes = f", and {n} of {n} fixes without a height" if gps is not None else " and no fix"
     text = f"nothing measures the height (no depth{fixes}), which is scored in 3D; `dims: 2d` scores the horizontal"
     return (Note(text, "height", "" if gps is None else "gps", n, n or None),)
+
+
+def _of_earth(rig: Rig, estimator: object) -> Iterator[Note]:
+    """Yield whether an estimator that can model the Earth's rotation does so, where the latitude is known."""
+    option = _stated(estimator, "earth_rotation")
+    if rig.latitude_deg is not None and (isinstance(option, bool) or option == "auto"):
+        said = "modelled" if turns_with_earth(rig, option) else "left out (earth_rotation: false)"
+        yield Note(f"{said}, at latitude {rig.latitude_deg:.1f}°", "earth")
 
 
 def _of_streams(log: Log) -> Iterator[Note]:

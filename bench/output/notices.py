@@ -24,6 +24,7 @@ WORDS = {
     "start": "start",
     "overclaims": "claims more than it knows",
     "height": "height",
+    "earth": "the Earth's rotation",
     "gap": "IMU gaps bridged",
     "outside": "outside the IMU's time",
     "late_dropped": "late and dropped",
@@ -38,7 +39,7 @@ assert list(WORDS) == [kind for kind in KINDS if kind != "about"]
 PLACES = {kind: place for place, kind in enumerate(WORDS)}
 ROUTINE = ("outside", "late", "merged", "carried", "void")
 """Kinds that are no fault of a log; the terminal has one line for each, of the log where it is most."""
-IN_WORDS = ("damage", "check", "silent", "repaired", "start", "overclaims", "height")
+IN_WORDS = ("damage", "check", "silent", "repaired", "start", "overclaims", "height", "earth")
 """Kinds whose sentences say more than a number."""
 TEXT_LETTERS = 150
 """Of a note's sentence in a line: two lines of a terminal of 80 columns."""

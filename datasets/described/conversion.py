@@ -2,8 +2,8 @@
 
 The steps are the same for every stream. Rows declared invalid or outside the window are dropped. Rows with numbers
 that are not finite are an error, or dropped with `repair`. Declared outliers are dropped. Times out of order are an
-error, or dropped with `repair`. Every n-th row is kept. `Log.notes` counts all that was dropped. A truth or a stream
-that does not overlap the IMU's time is an error: some clock is wrong.
+error, or dropped with `repair`. Of means that overlap, those are kept that do not; of these, every n-th. `Log.notes`
+counts all that was dropped. A truth or a stream that does not overlap the IMU's time is an error: some clock is wrong.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def _dvl(opening: Opening, part: d.DvlDescription) -> DvlStream:
     check_width(rows, part, len(measured))
     rows.values["z"] = rows.si(part.velocity)
     drop_outliers(rows, part.outliers, "z", "m/s")
-    rows.put_in_order(part.every)
+    rows.put_in_order(part.every, part.averaged_over_s)
     v_S, spread = np.zeros((len(rows.t_ns), 3)), np.full((len(rows.t_ns), 3), np.inf)
     v_S[:, measured], spread[:, measured] = rows.values["z"], sigma(rows, part, len(measured))
     v_S = flu(v_S, part.axes)
@@ -179,7 +179,7 @@ def _depth(opening: Opening, part: d.DepthDescription) -> DepthStream:
     rows = read_rows(opening, "depth", part, list(part.depth.columns))
     rows.values["z"] = rows.si(part.depth)
     drop_outliers(rows, part.outliers, "z", "m")
-    rows.put_in_order(part.every)
+    rows.put_in_order(part.every, part.averaged_over_s)
     z_m = -rows.values["z"] if part.positive == "down" else rows.values["z"]
     return DepthStream(rows.t_ns, rows.received_ns, z_m, sigma(rows, part, 1))
 
@@ -191,7 +191,7 @@ def _heading(
         rows = read_rows(opening, "heading", part, list(part.attitude.columns))
         check_width(rows, part, 3)
         _put_rotations(rows, part.attitude, origin)
-        rows.put_in_order(part.every)
+        rows.put_in_order(part.every, part.averaged_over_s)
         return AttitudeStream(rows.t_ns, rows.received_ns, rows.values["R"].reshape(-1, 9), sigma(rows, part, 3))
     assert part.heading is not None
     rows = read_rows(opening, "heading", part, list(part.heading.columns))
@@ -204,7 +204,7 @@ def _heading(
         psi = np.arctan2(np.sin(psi), np.cos(psi))
     rows.values["z"] = psi
     drop_outliers(rows, part.outliers, "z", "rad")
-    rows.put_in_order(part.every)
+    rows.put_in_order(part.every, part.averaged_over_s)
     return HeadingStream(rows.t_ns, rows.received_ns, rows.values["z"], sigma(rows, part, 1))
 
 
@@ -239,7 +239,7 @@ def _gps(part: d.GpsDescription, rows: Rows, origin: tuple[float, float] | None)
     check_width(rows, part, 3)
     rows.values["z"] = position(rows, part, origin)
     drop_outliers(rows, part.outliers, "z", "m")
-    rows.put_in_order(part.every)
+    rows.put_in_order(part.every, part.averaged_over_s)
     spread = sigma(rows, part, 3)
     if part.position is None and part.geodetic is not None and part.geodetic.altitude is None:
         spread[:, 2] = np.inf

@@ -369,6 +369,9 @@ class AidingDescription(StreamDescription):
 
     sigma_field: ClassVar[str]
     outliers: Outliers | None = None
+    averaged_over_s: Annotated[Shift, Field(ge=0)] = 0.0
+    """Each reading is the mean of the last so many seconds: it was true at their middle. Overlapping means share
+    errors, so only those are kept that do not overlap. Sigma is that of a mean."""
 
     @property
     def spread(self) -> Quantity | None:

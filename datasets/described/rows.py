@@ -27,6 +27,8 @@ REPEATED_SHARE = 0.5
 """A reading that changes repeats itself by chance in far fewer rows, in all of its components at once."""
 CHANGES = 5
 """Readings that change less often are those of something that stands still."""
+JITTER = 0.01
+"""Of the length of means: by so much they may overlap, as clocks jitter; neighbours then share 1 % of their errors."""
 COMMA = re.compile(r"[-+]?\d+,\d+")
 COMMA_HINT = "; `decimal: ','`?"
 
@@ -132,8 +134,8 @@ class Rows:
                 values = values + np.asarray(quantity.offset)
             return values if factor == 1.0 else values * factor
 
-    def put_in_order(self, every: int = 1) -> None:
-        """Refuse times out of order, settle what was wrong with the rows, and keep every n-th of them.
+    def put_in_order(self, every: int = 1, averaged_over_s: float = 0.0) -> None:
+        """Refuse times out of order, settle what was wrong with the rows, and keep every n-th without overlap.
 
         Raises:
             DatasetError: as `settle`; or the times are not what the description says.
@@ -148,11 +150,30 @@ class Rows:
             self.total, self.dropped = self.total - twins, self.dropped - twins
             self.refuse(found.lost | found.twins, lambda row: complaint(t_ns, row), "out of order")
         self.settle()
+        if averaged_over_s:
+            mask = apart(self.t_ns, averaged_over_s)
+            kept = f"{int(mask.sum())} of {len(mask)} rows kept, which do not overlap"
+            text = f"{self.stream}: means over {averaged_over_s:g} s; {kept}"
+            self.opening.notes.append(text)
+            self.keep(mask)
         if every > 1:
             mask = np.zeros(len(self.t_ns), bool)
             mask[::every] = True
             self.opening.notes.append(f"{self.stream}: every {every}th row kept, {int(mask.sum())} of {len(mask)}")
             self.keep(mask)
+
+
+def apart(t_ns: TimeArray, averaged_over_s: float) -> NDArray[np.bool_]:
+    """Return which of increasing times (n,) to keep, from the first on, so that means over so many seconds are apart.
+
+    Means that overlap by JITTER of their length count as apart.
+    """
+    mask = np.zeros(len(t_ns), bool)
+    step_ns, row = round((1 - JITTER) * averaged_over_s * 1e9), 0
+    while row < len(t_ns):
+        mask[row] = True
+        row = max(row + 1, int(np.searchsorted(t_ns, t_ns[row] + step_ns)))
+    return mask
 
 
 def read_rows(
@@ -181,6 +202,7 @@ def read_rows(
             raise DatasetError(f"{opening.folder}: {stream}: column {column!r} cannot be {what} and something else")
     raw, flaws = opening.columns(part, plain, texts)
     rows = _timed(opening, stream, time, raw, flaws)
+    rows.t_ns = rows.t_ns - round(0.5e9 * getattr(part, "averaged_over_s", 0.0))
     if valid is not None:
         _use_valid(rows, valid)
     _refuse_other_unit(rows, time, stamps)

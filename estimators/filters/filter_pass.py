@@ -22,7 +22,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ...datasets.trajectory import Trajectory
 from ..interface import FACTORS, OUTLIERS, Diverged, Factors, Gate, Inflation
-from ..physics.imu import BLOCK, compile_rig, first_sample, split
+from ..physics.imu import BLOCK, EarthRotation, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
 from ..stages import staged
@@ -41,7 +41,7 @@ class FilterOptions:
             counted. A filter that has drifted rejects good readings too, and may never recover.
         max_delay_s: how far it can rewind for a late reading.
         merge_ns: a reading at most this much older than its epoch is taken as of its epoch, and counted.
-        earth_rotation: W turns with the Earth (see `imu`); needs the rig's latitude.
+        earth_rotation: W turns with the Earth (see `imu`); "auto": if the rig knows its latitude.
     """
 
     factors: Factors = FACTORS
@@ -49,7 +49,7 @@ class FilterOptions:
     gate: Gate = Field(default_factory=dict)
     max_delay_s: NotNegative = 5.0
     merge_ns: Whole = Field(default=1_000_000, ge=0)
-    earth_rotation: bool = False
+    earth_rotation: EarthRotation = "auto"
 
 
 class Kalman(ABC):

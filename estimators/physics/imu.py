@@ -22,7 +22,7 @@ block's start, i:
     R_j = R_i ΔR        v_j = v_i + g T + R_i Δv        p_j = p_i + v_i T + ½ g T² + R_i Δp
 
 An IMU senses its motion over the celestial frame C, the stars; W turns under it with the Earth, at Ω = w_CW_W (where
-`earth_rotation` says so; else Ω = 0). Over C, in the axes that W has at i and about the place that B has at i, all of
+`earth_rotation` lets it; else Ω = 0). Over C, in the axes that W has at i and about the place that B has at i, all of
 this holds unchanged, lever arm included, except that gravity turns with W. Back over W, with E = Exp(−Ω T),
 
     R_j = E R_i ΔR        p_j = p_i + E u        v_j = E (v_i + g₁ + R_i Δv) − Ω × E u        u = v_i T + g₂ + R_i Δp
@@ -36,7 +36,7 @@ Coning, sculling: Savage 1998, doi:10.2514/2.4228 and 2.4242, the forms for one 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,8 @@ from .so3 import (
 )
 from .state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0
 
+EarthRotation = bool | Literal["auto"]
+"""Whether an estimator lets W turn with the Earth; "auto": where the rig knows its latitude."""
 HELD_RATE = 0.1
 """rad/s: how far the rate may stray, for the whole of a gap, from the sample that is held over it."""
 HELD_ACCEL = 0.5
@@ -104,13 +106,18 @@ BLOCK = np.dtype(
 )
 
 
+def turns_with_earth(rig: Rig, earth_rotation: EarthRotation) -> bool:
+    """Return whether W turns with the Earth, by the option; "auto" is where the rig knows its latitude."""
+    return rig.latitude_deg is not None if earth_rotation == "auto" else earth_rotation
+
+
 def compile_rig(
-    rig: Rig, factors: frozenset[str], inflate: dict[str, float], earth_rotation: bool = False
+    rig: Rig, factors: frozenset[str], inflate: dict[str, float], earth_rotation: EarthRotation = False
 ) -> NDArray[Any]:
     """Return the rig as one RIG record; sensors that are not in `factors` get an infinite sigma.
 
     Raises:
-        DatasetError: earth_rotation, of a rig whose latitude is not known.
+        DatasetError: earth_rotation is True, of a rig whose latitude is not known.
     """
     record = np.zeros(1, RIG)
     noise = rig.imu_noise
@@ -119,7 +126,7 @@ def compile_rig(
     record["gyro_density"] = noise.gyro_density * inflate.get("gyro", 1.0)
     record["accel_density"] = noise.accel_density * inflate.get("accel", 1.0)
     record["gyro_walk"], record["accel_walk"], record["gravity"] = noise.gyro_walk, noise.accel_walk, rig.gravity
-    if earth_rotation:
+    if turns_with_earth(rig, earth_rotation):
         record["w_CW_W"] = rig.w_CW_W
     for kind, sensor in enumerate(("dvl", "depth", "gps", "heading", "heading")):
         record["inflate"][0, kind] = inflate.get(sensor, 1.0) if sensor in factors else np.inf

@@ -50,7 +50,9 @@ NEARLY: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def log() -> Log:
-    simulated = simulate(Scenario(mission="lawnmower", duration_s=60, imu="industrial"), seed=2)
+    simulated = simulate(
+        Scenario(mission="lawnmower", duration_s=60, imu="industrial", latitude_deg=ORIGIN_DEG[0]), seed=2
+    )
     return replace(simulated, prior=None, origin=ORIGIN_DEG)  # most formats hold no prior: every log starts alike
 
 

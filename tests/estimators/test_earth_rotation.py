@@ -53,6 +53,22 @@ def test_every_estimator_refuses_to_guess_the_latitude(name: str) -> None:
     assert run_log(simulate(Scenario(duration_s=20.0, latitude_deg=10.0), 1), estimator).status == "done"
 
 
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_earth_turns_by_default_where_the_latitude_is_known(name: str) -> None:
+    options = {"attitude": "gyro"} if name == "dead-reckoning" else {}
+    ends = {}
+    for latitude_deg in (None, 50.0):
+        log = simulate(Scenario(duration_s=20.0, latitude_deg=latitude_deg), seed=1)
+        for earth_rotation in ({}, {"earth_rotation": "auto"}, {"earth_rotation": latitude_deg is not None}):
+            result = run_log(log, create(name, **options, **earth_rotation))
+            ends.setdefault(latitude_deg, []).append(result.online.R_WB[-1])
+    for by_default, auto, stated in ends.values():
+        assert np.array_equal(by_default, auto)
+        assert np.array_equal(by_default, stated)
+    ignored = run_log(log, create(name, **options, earth_rotation=False)).online.R_WB[-1]
+    assert not np.array_equal(ignored, ends[50.0][0])
+
+
 def test_a_log_keeps_its_latitude_on_disk(tmp_path: FilePath) -> None:
     for latitude_deg in (None, -33.3):
         log = simulate(Scenario(duration_s=20.0, latitude_deg=latitude_deg), seed=1)

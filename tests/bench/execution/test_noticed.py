@@ -93,3 +93,15 @@ def test_a_height_that_nothing_measures_is_told_with_counts() -> None:
     assert f"no depth, and {n} of {n} fixes without a height" in note
     assert "no fix" in unmeasured_height(log, {"dvl"})[0]
     assert unmeasured_height(replace(log, truth=None), {"dvl"}) == ()
+
+
+def test_a_run_says_whether_the_earth_turns_if_the_latitude_is_known() -> None:
+    still, turning = (simulate(Scenario(duration_s=20.0, latitude_deg=x), seed=1) for x in (None, -33.04))
+
+    def said(log: Log, **options: object) -> list[str]:
+        notes = run_log(log, create("eskf", **options)).notes
+        return [str(note) for note in notes if getattr(note, "kind", "") == "earth"]
+
+    assert said(still) == []
+    assert said(turning) == ["modelled, at latitude -33.0°"]
+    assert said(turning, earth_rotation=False) == ["left out (earth_rotation: false), at latitude -33.0°"]

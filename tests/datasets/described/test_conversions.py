@@ -13,6 +13,7 @@ import yaml
 from fathom.datasets import DatasetError, Log
 from fathom.datasets.described import description as description_module
 from fathom.datasets.described.opening import open_log
+from fathom.datasets.described.rows import apart as means_apart
 from fathom.datasets.formats.recording import Messages, Recording, TopicInfo, Wanted
 from fathom.datasets.log import AttitudeStream
 from scipy.spatial.transform import Rotation
@@ -278,6 +279,49 @@ def test_outliers_are_of_the_columns_that_are_there(folder, velocities):
     part["outliers"] = {"above": 1.0, "components": [1]}
     with pytest.raises(DatasetError, match="dvl: outliers: it has 1 components only"):
         opened(folder, {"dvl": part})
+
+
+# -- readings that are means of the last seconds
+
+
+@pytest.mark.parametrize(("jitter_s", "every"), [(0.0, 1), (0.004, 1), (0.0, 2)])
+def test_a_mean_is_of_its_middle_and_means_that_overlap_are_left_out(folder, jitter_s: float, every: int) -> None:
+    """A trailing mean over a second of what changes linearly is what there was half a second before."""
+    stamp = 101.5 + np.arange(80) / 10
+    stamp[1::2] += jitter_s
+    depth = 7.0 + 0.3 * (stamp - 0.5)
+    write(folder, "depth.csv", {"t": stamp, "d": depth})
+    part = {"table": {"file": "depth.csv"}, "time": {"column": "t"}, "depth": {"columns": ["d"], "unit": "m"}}
+    part |= {"positive": "down", "sigma_m": 0.1, "averaged_over_s": 1.0, "every": every}
+    log = opened(folder, {"depth": part})
+    read = log.depth
+    t_s = read.t_ns * 1e-9
+    np.testing.assert_allclose(read.z[:, 0], -(7.0 + 0.3 * t_s), atol=1e-6)
+    assert np.all(read.received_ns - read.t_ns == 500_000_000)
+    assert len(read) == np.ceil(8 / every)
+    assert np.diff(t_s).min() > every * (1.0 - 0.011)
+    assert "depth: means over 1 s; 8 of 80 rows kept, which do not overlap" in log.notes
+
+
+def test_readings_that_do_not_overlap_are_all_kept() -> None:
+    t_ns = np.arange(20) * 1_500_000_000
+    assert means_apart(t_ns, 1.0).all()
+    assert np.flatnonzero(means_apart(t_ns, 1.6)).tolist() == list(range(0, 20, 2))
+    assert means_apart(t_ns[:1], 9.0).tolist() == [True]
+    assert means_apart(t_ns[:0], 9.0).tolist() == []
+
+
+def test_what_is_kept_of_overlapping_means_has_white_errors() -> None:
+    """White noise at 100 Hz, a mean of the last 100 ten times a second: neighbours share 0.9, kept ones none."""
+    rng = np.random.default_rng(0)
+    summed = np.concatenate([[0.0], np.cumsum(rng.standard_normal(400_000))])
+    ends = np.arange(100, 400_001, 10)
+    means, t_ns = (summed[ends] - summed[ends - 100]) / 100, ends * 10_000_000
+    kept = means[means_apart(t_ns, 1.0)]
+    shared = [np.corrcoef(x[1:], x[:-1])[0, 1] for x in (means, kept)]
+    assert shared[0] == pytest.approx(0.9, abs=0.02)
+    assert abs(shared[1]) < 3.3 / np.sqrt(len(kept))
+    assert len(kept) == 4000
 
 
 # -- earth-centred places, velocities and attitudes
