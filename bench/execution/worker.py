@@ -163,7 +163,7 @@ class WorkerCache:
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
             "notes": json.dumps([as_data(note) for note in (*log.notes, *task.checked, *result.notes)]),
-            **costs(result),
+            **costs(result, scoring.output_rate_hz),
             **extra,
         }
         if log.truth is not None and result.online is not None:

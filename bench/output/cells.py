@@ -147,10 +147,18 @@ OTHERS = (
     Column("drift_max_percent", "largest drift", "%"),
     Column("outage_percent", "outage drift", "%"),
     Column("energy_score_m", "energy score", "m"),
+    Column("step_cpu_median_us", "step processor", "µs"),
     Column("us_per_imu_sample", "per IMU sample", "µs"),
+    Column("us_per_imu_sample_with_outputs", "with outputs", "µs"),
     Column("peak_mb", "peak memory", "MB"),
 )
 """What other tables and figures show."""
+
+COST = (
+    *("step_median_us", "step_cpu_median_us", "step_p99_us", "real_time_factor"),
+    *("us_per_imu_sample", "us_per_imu_sample_with_outputs", "peak_mb"),
+)
+"""The scores of the table of costs."""
 
 KNOWN = {column.score: column for column in (*ACCURACY, *OTHERS)}
 

@@ -274,6 +274,13 @@ def test_costs_add_up(log: Log) -> None:
     assert row["total_s"] == pytest.approx(result.step_ns.sum() * 1e-9 + result.finish_ns * 1e-9)
     assert row["real_time_factor"] == pytest.approx(30.0 / row["total_s"])
     assert row["us_per_imu_sample"] == pytest.approx(1e6 * row["total_s"] / 3000)
+    assert result.step_cpu_ns.shape == result.step_ns.shape
+    assert row["cpu_s"] < 0.5 * row["total_s"]  # a sleeping thread does not work
+    assert row["step_cpu_median_us"] == pytest.approx(np.median(result.step_cpu_ns) / 1e3)
+    outputs_s = 30.0 * 50 * result.belief_ns.mean() * 1e-9
+    charged = costs(result, 50.0)["us_per_imu_sample_with_outputs"]
+    assert charged == pytest.approx(1e6 * (row["total_s"] + outputs_s) / 3000)
+    assert costs(result, 0.0)["us_per_imu_sample_with_outputs"] == row["us_per_imu_sample"]
     assert 1000 <= row["step_median_us"] <= row["step_p99_us"] <= row["step_max_us"]
 
 
