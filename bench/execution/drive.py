@@ -106,7 +106,8 @@ class NisCollector:
     """Collects the NIS of each reading, against the belief predicted before any reading of its epoch.
 
     An epoch is driven in two halves, its motion and its readings; the belief is asked for between them. Late readings
-    are left out, since they are about an earlier state. An estimator that keeps no covariance has no NIS.
+    are about an earlier state. An estimator that can judge them itself, as it ties them, has a method `watch_late`, as
+    filters that replay do; of others they are left out. An estimator that keeps no covariance has no NIS.
 
     Attributes:
         counts: readings left out because they came late ("nis_late"), or because S is not positive ("nis_undefined").
@@ -116,6 +117,7 @@ class NisCollector:
         self.counts = {"nis_late": 0, "nis_undefined": 0}
         self._rig = compile_rig(rig, estimator.factors, getattr(estimator, "inflate", {}))
         self._tables: list[NDArray[Any]] = []
+        self._of_late: list[NDArray[Any]] = []
 
     def wants(self, epoch: Epoch) -> bool:
         """Return whether any reading of the epoch is on time."""
@@ -137,9 +139,19 @@ class NisCollector:
         self.counts["nis_undefined"] += int((~defined).sum())
         self._tables.append(table[defined])
 
+    def watch(self, run: Pass) -> None:
+        """Let a pass judge the late readings that it ties, if it can."""
+        watch_late = getattr(run, "watch_late", None)
+        self._of_late = [] if watch_late is None else watch_late()
+
     def table(self) -> NDArray[Any]:
-        """Return all innovations, as INNOVATION rows."""
-        return np.concatenate([np.zeros(0, INNOVATION), *self._tables])
+        """Return all innovations, once, as INNOVATION rows in the order of their times; count those left out."""
+        late = np.concatenate([np.zeros(0, INNOVATION), *self._of_late])
+        defined = np.isfinite(late["nis"]) & (late["dof"] > 0)
+        self.counts["nis_late"] -= len(late)
+        self.counts["nis_undefined"] += int((~defined).sum())
+        every = np.concatenate([late[defined], *self._tables])
+        return every[np.argsort(every["t_ns"], kind="stable")]
 
     @staticmethod
     def _on_time(epoch: Epoch) -> NDArray[np.bool_]:
@@ -195,6 +207,8 @@ def run_log(
                 run = estimator.begin(log.prior, log.rig)
                 if not ours:
                     check_pass(run, estimator)
+                elif collector is not None:
+                    collector.watch(run)
             except BaseException as error:  # another package's code may raise anything
                 ending = Ending.by(error, voyage.start_ns)
             else:
@@ -207,6 +221,7 @@ def run_log(
 
     driven = voyage.epochs[: len(recorder.step_ns)]
     end_ns = driven[-1].t_ns if driven else voyage.start_ns
+    innovations_found = collector.table() if collector else None
     late = late_readings(log, factors, voyage.start_ns, end_ns)
     known = {"readings": readings, "readings_late": late} | voyage.counts | (collector.counts if collector else {})
     counts |= known  # what is counted here is no estimator's to say
@@ -224,7 +239,7 @@ def run_log(
         sum(len(epoch.imu) for epoch in driven),
         start,
         (*notes, *noticed(log, counts)),
-        collector.table() if collector else None,
+        innovations_found,
         ending.traceback,
         (np.array(recorder.step_cpu_ns, np.int64) - _of_driving_ns(voyage)).clip(0),
         finish_ns[1],

@@ -39,7 +39,7 @@ class Result:
         start: where the prior came from: "given" by the log's maker, else what `initialise` found: "static", "moving",
             and after a comma what is unusual in that.
         notes: how the start was found and what was noticed of the readings, in sentences; see `datasets.notes.Note`.
-        nis: INNOVATION rows, in the order of reception; None where they were not asked for.
+        nis: INNOVATION rows, in the order of their times; None where they were not asked for.
         traceback: of the error that ended it; None for any other ending.
         step_cpu_ns: (epochs,) processor time of this thread in each `step`; it is less than `step_ns` where the thread
             had to wait, for the processor or for other threads.
@@ -72,7 +72,7 @@ class Result:
 
 
 def innovation_scores(result: Result) -> dict[str, float | None]:
-    """Return every score of INNOVATIONS by name; None where it was not asked for, or no such reading came in time."""
+    """Return every score of INNOVATIONS by name; None where it was not asked for, or no such reading was judged."""
     row: dict[str, float | None] = dict.fromkeys(INNOVATIONS)
     for sensor, dof in innovation_dof(result).items():
         of_sensor = _of_sensor(result, sensor)

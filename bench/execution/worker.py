@@ -185,7 +185,11 @@ class WorkerCache:
             except ScoreError as error:  # a look-ahead that is not defined, say: the other scores stand
                 missing |= dict.fromkeys(FLOORS, str(error))
             if scoring.nis:
-                why = "innovations are of the online output" if output != "online" else "no such reading came in time"
+                why = (
+                    "innovations are of the online output"
+                    if output != "online"
+                    else "no such reading that came in time or was replayed"
+                )
                 missing |= {name: why for name in INNOVATIONS if row.get(name) is None}
             row["missing"] = json.dumps(by_reason(missing))
             if can_judge(log, scoring):

@@ -212,7 +212,7 @@ def _reason(score: str, row: Record) -> str:
     if score in missing:
         return missing[score]
     if score in INNOVATIONS:
-        return "no innovations (smoothed, or no reading in time)"
+        return "no innovations (smoothed, or late readings that a smoother ties)"
     if score.startswith("over_floor_"):
         return missing.get(OVER[score.removeprefix("over_floor_")][1], "no floor of this output")
     return missing.get(score.replace("anees_", "nees_"), "not defined for this run")

@@ -208,7 +208,7 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
         "squared errors over their covariance, per degree of freedom: 1 is consistent, more is overconfident",
         f"ANEES: over {seeds} runs, at {times} fixed times; ▲k, ▼k: at k of them above, below the chi-square interval"
         + ("" if seeds >= FEWEST_SEEDS else "; with so few seeds that interval is wide"),
-        ("NIS: over all readings that came in time; " if sensors else "")
+        ("NIS: over all readings in time, and late ones that a filter replays; " if sensors else "")
         + "position within 1, 2, 3 σ: 68, 95, 99.7 % if consistent",
     ]
 

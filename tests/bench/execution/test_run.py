@@ -412,6 +412,29 @@ def test_readings_that_come_late_are_counted_and_not_judged(log: Log) -> None:
     assert result.counts["nis_undefined"] == 0
 
 
+@pytest.mark.parametrize("name", ["eskf", "iekf", "rts"])
+def test_late_readings_are_judged_where_they_are_replayed(name: str) -> None:
+    late = simulate(Scenario(duration_s=30.0, surface_for_s=30.0, **DELAYED), seed=3)
+    result, plain = run_log(late, create(name), nis=True), run_log(late, create(name))
+    dof = innovation_dof(result)
+    heard = {name: int((late.streams[name].received_ns <= late.imu.t_ns[-1]).sum()) for name in ("dvl", "gps")}
+    assert {name: dof[name] for name in heard} == {name: 3 * n for name, n in heard.items()}  # each of them, once
+    assert (result.counts["nis_late"], result.counts["nis_undefined"]) == (0, 0)
+    assert (np.diff(result.nis["t_ns"]) >= 0).all()
+    row = innovation_scores(result)
+    for sensor, n in dof.items():
+        low, high = chi2.interval(1 - 1e-4, n)
+        assert low < row[f"nis_{sensor}"] * n < high, sensor
+    assert np.abs(result.online.p_WB_W - plain.online.p_WB_W).max() < 1e-9
+
+
+def test_a_reading_too_late_to_be_replayed_is_counted_and_not_judged() -> None:
+    late = simulate(Scenario(duration_s=30.0, **DELAYED), seed=3)
+    result = run_log(late, create("eskf", max_delay_s=0.5), nis=True)
+    assert innovation_dof(result).keys() == {"dvl", "depth", "heading"}
+    assert result.counts["nis_late"] == result.counts["late"] > 0
+
+
 def test_a_belief_under_which_no_reading_is_possible_is_counted(log: Log) -> None:
     exact = truthful(log)
     result = run_log(log, Fake(lambda t_ns: (exact(t_ns)[0], -100 * np.eye(15))), nis=True)
