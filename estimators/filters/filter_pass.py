@@ -21,7 +21,7 @@ from ...datasets.quantities import NotNegative, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ...datasets.trajectory import Trajectory
-from ..interface import FACTORS, OUTLIERS, Diverged, Factors, Gate, Inflation
+from ..interface import FACTORS, MERGE_NS, OUTLIERS, Diverged, Factors, Gate, Inflation
 from ..physics.imu import BLOCK, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
@@ -48,7 +48,7 @@ class FilterOptions:
     inflate: Inflation = Field(default_factory=dict)
     gate: Gate = Field(default_factory=dict)
     max_delay_s: NotNegative = 5.0
-    merge_ns: Whole = Field(default=1_000_000, ge=0)
+    merge_ns: Whole = Field(default=MERGE_NS, ge=0)
     earth_rotation: bool = False
 
 
