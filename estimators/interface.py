@@ -40,6 +40,10 @@ Inflation = Annotated[dict[str, Positive], sensors_among(FACTORS | {"gyro", "acc
 Gate = Annotated[dict[str, Annotated[Number, Field(gt=0, lt=1)]], sensors_among(FACTORS)]
 """Probability by sensor: a reading is left out if its NIS exceeds the chi-square quantile of this probability."""
 
+MERGE_NS = 1_000_000
+"""A reading this close to an epoch or a keyframe is taken as of its time, by filters and smoothers alike, unless an
+option says otherwise: 1 ms, in which 2 m/s is 2 mm and 30°/s is 0.03°."""
+
 OUTLIERS = "outliers_"
 """Prefix, before the sensor's name, of the counts of readings left out by a gate, or given less weight by a loss."""
 

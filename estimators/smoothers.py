@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 from ..datasets.quantities import NotNegative, Positive, Whole
 from ..datasets.rig import Rig
 from ..datasets.state import Belief
-from .interface import FACTORS, Factors, Inflation, Pass
+from .interface import FACTORS, MERGE_NS, Factors, Inflation, Pass
 from .physics.imu import EarthRotation
 from .robust import Losses
 
@@ -71,7 +71,7 @@ class GraphSmoother(ABC):
     keyframe_period_s: Positive | None = None
     keyframe_timeout_s: Positive = 0.5
     max_hold_s: Positive = 1.5
-    merge_ns: Whole = Field(default=5_000_000, ge=0)
+    merge_ns: Whole = Field(default=MERGE_NS, ge=0)
     factors: Factors = FACTORS
     inflate: Inflation = Field(default_factory=dict)
     robust: Losses = Field(default_factory=dict)

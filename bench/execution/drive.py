@@ -7,9 +7,9 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from time import perf_counter_ns
+from time import perf_counter_ns, thread_time_ns
 from traceback import format_exception
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,7 @@ class Recorder:
 
     def __init__(self, ticks: int) -> None:
         self.step_ns: list[int] = []
+        self.step_cpu_ns: list[int] = []
         self.belief_ns: list[int] = []
         self.t_ns = np.zeros(ticks, np.int64)
         self.R_WB = np.zeros((ticks, 3, 3))
@@ -105,7 +106,8 @@ class NisCollector:
     """Collects the NIS of each reading, against the belief predicted before any reading of its epoch.
 
     An epoch is driven in two halves, its motion and its readings; the belief is asked for between them. Late readings
-    are left out, since they are about an earlier state. An estimator that keeps no covariance has no NIS.
+    are about an earlier state. An estimator that can judge them itself, as it ties them, has a method `watch_late`, as
+    filters that replay do; of others they are left out. An estimator that keeps no covariance has no NIS.
 
     Attributes:
         counts: readings left out because they came late ("nis_late"), or because S is not positive ("nis_undefined").
@@ -115,6 +117,7 @@ class NisCollector:
         self.counts = {"nis_late": 0, "nis_undefined": 0}
         self._rig = compile_rig(rig, estimator.factors, getattr(estimator, "inflate", {}))
         self._tables: list[NDArray[Any]] = []
+        self._of_late: list[NDArray[Any]] = []
 
     def wants(self, epoch: Epoch) -> bool:
         """Return whether any reading of the epoch is on time."""
@@ -136,9 +139,19 @@ class NisCollector:
         self.counts["nis_undefined"] += int((~defined).sum())
         self._tables.append(table[defined])
 
+    def watch(self, run: Pass) -> None:
+        """Let a pass judge the late readings that it ties, if it can."""
+        watch_late = getattr(run, "watch_late", None)
+        self._of_late = [] if watch_late is None else watch_late()
+
     def table(self) -> NDArray[Any]:
-        """Return all innovations, as INNOVATION rows."""
-        return np.concatenate([np.zeros(0, INNOVATION), *self._tables])
+        """Return all innovations, once, as INNOVATION rows in the order of their times; count those left out."""
+        late = np.concatenate([np.zeros(0, INNOVATION), *self._of_late])
+        defined = np.isfinite(late["nis"]) & (late["dof"] > 0)
+        self.counts["nis_late"] -= len(late)
+        self.counts["nis_undefined"] += int((~defined).sum())
+        every = np.concatenate([late[defined], *self._tables])
+        return every[np.argsort(every["t_ns"], kind="stable")]
 
     @staticmethod
     def _on_time(epoch: Epoch) -> NDArray[np.bool_]:
@@ -178,7 +191,7 @@ def run_log(
     log, start, notes = _with_prior(log)
     assert log.prior is not None
     limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
-    smoothed, finish_ns, counts, collector = None, 0, {}, None
+    smoothed, finish_ns, counts, collector = None, (0, 0), {}, None
     ours = is_ours(estimator)
     content = None if ours else content_sha256(log)
     with _collector_off(), nullcontext() if ours else process_kept():
@@ -194,6 +207,8 @@ def run_log(
                 run = estimator.begin(log.prior, log.rig)
                 if not ours:
                     check_pass(run, estimator)
+                elif collector is not None:
+                    collector.watch(run)
             except BaseException as error:  # another package's code may raise anything
                 ending = Ending.by(error, voyage.start_ns)
             else:
@@ -206,6 +221,7 @@ def run_log(
 
     driven = voyage.epochs[: len(recorder.step_ns)]
     end_ns = driven[-1].t_ns if driven else voyage.start_ns
+    innovations_found = collector.table() if collector else None
     late = late_readings(log, factors, voyage.start_ns, end_ns)
     known = {"readings": readings, "readings_late": late} | voyage.counts | (collector.counts if collector else {})
     counts |= known  # what is counted here is no estimator's to say
@@ -217,14 +233,16 @@ def run_log(
         smoothed,
         np.array(recorder.step_ns, np.int64),
         np.array(recorder.belief_ns, np.int64),
-        finish_ns,
+        finish_ns[0],
         counts,
         (end_ns - voyage.start_ns) * 1e-9,
         sum(len(epoch.imu) for epoch in driven),
         start,
         (*notes, *noticed(log, counts, estimator)),
-        collector.table() if collector else None,
+        innovations_found,
         ending.traceback,
+        (np.array(recorder.step_cpu_ns, np.int64) - _of_driving_ns(voyage)).clip(0),
+        finish_ns[1],
     )
 
 
@@ -265,22 +283,29 @@ def _checked(online: Trajectory | None, ending: Ending) -> tuple[Trajectory | No
 
 
 def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, collector: NisCollector | None) -> Ending:
-    """Hand over every epoch, in halves for a collector; time `step` and `belief` apart, and collect garbage outside."""
-    clock, step, step_ns = perf_counter_ns, run.step, recorder.step_ns.append
-    t_ns = voyage.start_ns
+    """Hand over every epoch, in halves for a collector; time `step` and `belief` apart, and collect garbage outside.
+
+    The processor's clock takes up to 0.6 µs to read. It is read once a step, so what is kept has this loop in it.
+    """
+    clock, cpu, step = perf_counter_ns, thread_time_ns, run.step
+    step_ns, step_cpu_ns = recorder.step_ns.append, recorder.step_cpu_ns.append
+    t_ns, before_ns = voyage.start_ns, cpu()
     try:
         for epoch in voyage.epochs:
             t_ns, spent_ns = epoch.t_ns, 0
             if collector is not None and collector.wants(epoch):
                 started = clock()
                 step(epoch._replace(readings=epoch.readings[:0], tick=False))
-                spent_ns = clock() - started
+                spent_ns, judging_ns = clock() - started, cpu()
                 collector.judge(run.belief(), epoch)
                 epoch = epoch._replace(imu=epoch.imu[:0])
+                before_ns += cpu() - judging_ns
             started = clock()
             step(epoch)
-            ended = clock()
+            ended, after_ns = clock(), cpu()
             step_ns(spent_ns + ended - started)
+            step_cpu_ns(after_ns - before_ns)
+            before_ns = after_ns
             if ended > limit_ns:
                 return Ending("failed", "out of time", t_ns)
             if epoch.tick:
@@ -290,6 +315,7 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
                 recorder.keep(belief, t_ns)
                 recorder.belief_ns.append(ended - started)
                 gc.collect(0)
+                before_ns = cpu()
     except BaseException as error:  # another package's code may raise anything
         return Ending.by(error, t_ns)
     if voyage.failure is not None:
@@ -297,21 +323,45 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
     return Ending("done")
 
 
+class _Idle:
+    """Steps that do nothing."""
+
+    counts: ClassVar[dict[str, int]] = {}
+
+    def step(self, epoch: Epoch) -> None:
+        """Do nothing."""
+
+    def belief(self) -> Belief:
+        """Not asked for."""
+        raise NotImplementedError
+
+    def finish(self) -> Trajectory | None:
+        """Return None."""
+
+
+def _of_driving_ns(voyage: Voyage) -> int:
+    """Return the processor time of a step that does nothing: the least of a hundred."""
+    recorder, epochs = Recorder(0), [epoch._replace(tick=False) for epoch in voyage.epochs[:1]] * 100
+    _drive(_Idle(), replace(voyage, epochs=epochs), recorder, math.inf, None)
+    return min(recorder.step_cpu_ns, default=0)
+
+
 def _finish(
     run: Pass, voyage: Voyage, given_ns: TimeArray, ending: Ending
-) -> tuple[Trajectory | None, int, dict[str, int], Ending]:
-    """Return (smoothed trajectory, time it took, counts, ending); a run that had ended early keeps its own cause.
+) -> tuple[Trajectory | None, tuple[int, int], dict[str, int], Ending]:
+    """Return (smoothed trajectory, time and processor time it took, counts, ending).
 
-    `given_ns` (k,) are the ticks at which it gave a belief.
+    `given_ns` (k,) are the ticks at which it gave a belief. A run that had ended early keeps its own cause.
     """
     end_ns = voyage.epochs[-1].t_ns if voyage.epochs else voyage.start_ns
     smoothed, counts, end = None, {}, Ending("done")
-    started = ended = perf_counter_ns()
+    started, cpu_started = perf_counter_ns(), thread_time_ns()
+    took_ns = (0, 0)
     try:
         try:
             smoothed = run.finish()
         finally:
-            ended = perf_counter_ns()
+            took_ns = perf_counter_ns() - started, thread_time_ns() - cpu_started
             found = checked_counts(run, type(run).__name__)
             check_counts(found)
             counts = found
@@ -321,7 +371,7 @@ def _finish(
         end = Ending.by(error, end_ns)
     if end.status != "done":
         smoothed = None
-    return smoothed, ended - started, counts, end if ending.status == "done" else ending
+    return smoothed, took_ns, counts, end if ending.status == "done" else ending
 
 
 def _smoothed_ending(smoothed: Trajectory, voyage: Voyage, given_ns: TimeArray) -> Ending:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ...datasets.log import Log, ReadingStream
 from ...datasets.notes import Note
 from ...datasets.rig import Rig
-from ...estimators.interface import OUTLIERS
+from ...estimators.interface import MERGE_NS, OUTLIERS
 from ...estimators.physics.imu import turns_with_earth
 from ...estimators.unknown_start import yaw_sigma_rad
 
-ON_TIME_NS = 1_000_000
-"""A reading received at most this long after it was true came in time: 1 ms, in which 2 m/s is 2 mm."""
+ON_TIME_NS = MERGE_NS
+"""A reading received at most this long after it was true came in time."""
 
 
 def late_readings(log: Log, sensors: Collection[str], start_ns: int, end_ns: int) -> int:

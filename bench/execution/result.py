@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -13,7 +13,7 @@ from ...datasets.state import TimeArray
 from ...datasets.trajectory import Trajectory
 from ...estimators.physics.innovation import INNOVATION
 from ..metrics.consistency import autocorrelation
-from ..metrics.scoring import INNOVATIONS
+from ..metrics.scoring import INNOVATIONS, Scoring
 from ..results.step_time import step_histogram
 
 Status: TypeAlias = Literal["done", "diverged", "failed"]
@@ -39,8 +39,11 @@ class Result:
         start: where the prior came from: "given" by the log's maker, else what `initialise` found: "static", "moving",
             and after a comma what is unusual in that.
         notes: how the start was found and what was noticed of the readings, in sentences; see `datasets.notes.Note`.
-        nis: INNOVATION rows, in the order of reception; None where they were not asked for.
+        nis: INNOVATION rows, in the order of their times; None where they were not asked for.
         traceback: of the error that ended it; None for any other ending.
+        step_cpu_ns: (epochs,) processor time of this thread in each `step`; it is less than `step_ns` where the thread
+            had to wait, for the processor or for other threads.
+        finish_cpu_ns: the same of `finish`.
     """
 
     status: Status
@@ -58,6 +61,8 @@ class Result:
     notes: tuple[str, ...] = ()
     nis: NDArray[Any] | None = None
     traceback: str | None = None
+    step_cpu_ns: TimeArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    finish_cpu_ns: int = 0
 
     @property
     def outputs(self) -> dict[str, Trajectory]:
@@ -67,7 +72,7 @@ class Result:
 
 
 def innovation_scores(result: Result) -> dict[str, float | None]:
-    """Return every score of INNOVATIONS by name; None where it was not asked for, or no such reading came in time."""
+    """Return every score of INNOVATIONS by name; None where it was not asked for, or no such reading was judged."""
     row: dict[str, float | None] = dict.fromkeys(INNOVATIONS)
     for sensor, dof in innovation_dof(result).items():
         of_sensor = _of_sensor(result, sensor)
@@ -88,20 +93,31 @@ def _of_sensor(result: Result, sensor: str) -> NDArray[Any]:
     return nis[np.isin(nis["kind"], [kind for kind, name in enumerate(SENSOR) if name == sensor])]
 
 
-def costs(result: Result) -> dict[str, float | str | None]:
-    """Return every cost of COSTS that a result knows, by name, and its `step_histogram`; none where it has no step."""
+def costs(result: Result, output_rate_hz: float = Scoring().output_rate_hz) -> dict[str, float | str | None]:
+    """Return every cost of COSTS that a result knows, by name, and its `step_histogram`; none where it has no step.
+
+    Args:
+        result: of a run.
+        output_rate_hz: at which beliefs are charged, each with the mean time of those that were asked for.
+    """
     if not len(result.step_ns):
         return {}
     median_us, p99_us, max_us = (float(q) / 1e3 for q in np.percentile(result.step_ns, [50, 99, 100]))
     total_s = (int(result.step_ns.sum()) + result.finish_ns) * 1e-9
+    asked = len(result.belief_ns)
+    outputs_s = float(result.belief_ns.mean()) * 1e-9 * output_rate_hz * result.duration_s if asked else None
+    samples = max(result.imu_samples, 1)
     return {
         "step_median_us": median_us,
         "step_p99_us": p99_us,
         "step_max_us": max_us,
-        "belief_median_us": float(np.median(result.belief_ns)) / 1e3 if len(result.belief_ns) else None,
+        "step_cpu_median_us": float(np.median(result.step_cpu_ns)) / 1e3,
+        "belief_median_us": float(np.median(result.belief_ns)) / 1e3 if asked else None,
         "finish_s": result.finish_ns * 1e-9,
         "total_s": total_s,
+        "cpu_s": (int(result.step_cpu_ns.sum()) + result.finish_cpu_ns) * 1e-9,
         "real_time_factor": result.duration_s / total_s,
-        "us_per_imu_sample": 1e6 * total_s / max(result.imu_samples, 1),
+        "us_per_imu_sample": 1e6 * total_s / samples,
+        "us_per_imu_sample_with_outputs": None if outputs_s is None else 1e6 * (total_s + outputs_s) / samples,
         "step_histogram": step_histogram(result.step_ns),
     }

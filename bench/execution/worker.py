@@ -166,7 +166,7 @@ class WorkerCache:
             "start": result.start,
             "counts": json.dumps(plain(result.counts)),
             "notes": json.dumps([as_data(note) for note in notes]),
-            **costs(result),
+            **costs(result, scoring.output_rate_hz),
             **extra,
         }
         if log.truth is not None and result.online is not None:
@@ -188,7 +188,11 @@ class WorkerCache:
             except ScoreError as error:  # a look-ahead that is not defined, say: the other scores stand
                 missing |= dict.fromkeys(FLOORS, str(error))
             if scoring.nis:
-                why = "innovations are of the online output" if output != "online" else "no such reading came in time"
+                why = (
+                    "innovations are of the online output"
+                    if output != "online"
+                    else "no such reading that came in time or was replayed"
+                )
                 missing |= {name: why for name in INNOVATIONS if row.get(name) is None}
             row["missing"] = json.dumps(by_reason(missing))
             if can_judge(log, scoring):

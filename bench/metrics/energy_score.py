@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from ...datasets.state import Array
@@ -41,10 +43,19 @@ def mean_length(mean: Array, variances: Array) -> Array:
 
     E|x| = π^−½ ∫ (1 − E exp(−u² |x|²)) / u² du over u > 0, by Gauss's rule in (1 + w)/(1 − w) = u √E|x|².
     """
-    w, weight = np.polynomial.legendre.leggauss(NODES)
+    w, weight = _gauss()
     size = np.sqrt((variances + mean * mean).sum(axis=1))
     scale = np.where(size > 0.0, size, 1.0)
     u2 = (((1 + w) / (1 - w)) / scale[:, None]) ** 2
-    wide = 1.0 + 2.0 * variances[:, None] * u2[..., None]
-    exponent = (mean[:, None] ** 2 * u2[..., None] / wide + 0.5 * np.log(wide)).sum(axis=2)
-    return size / np.sqrt(np.pi) * (-np.expm1(-exponent) * 2.0 / (1 + w) ** 2 * weight).sum(axis=1)
+    exponent, product = np.zeros_like(u2), np.ones_like(u2)
+    for variance, square in zip(variances.T, (mean * mean).T, strict=True):
+        wide = 1.0 + 2.0 * variance[:, None] * u2
+        exponent += square[:, None] * u2 / wide
+        product *= wide
+    return size / np.sqrt(np.pi) * (-np.expm1(-exponent - 0.5 * np.log(product)) @ (2.0 / (1 + w) ** 2 * weight))
+
+
+@cache
+def _gauss() -> tuple[Array, Array]:
+    """Return the nodes and the weights, (NODES,) each, on −1 to 1."""
+    return np.polynomial.legendre.leggauss(NODES)

@@ -92,11 +92,14 @@ COSTS = {
     "step_median_us": "time of one step: median, µs",
     "step_p99_us": "time of one step: 99th percentile, µs",
     "step_max_us": "time of one step: maximum, µs",
+    "step_cpu_median_us": "processor time of one step: median, µs",
     "belief_median_us": "time of one belief: median, µs",
     "finish_s": "time of finish, s",
     "total_s": "time of all steps and finish, s",
+    "cpu_s": "processor time of the thread in all steps and finish, s",
     "real_time_factor": "length of the log divided by total_s",
     "us_per_imu_sample": "total_s divided by the number of IMU samples, µs",
+    "us_per_imu_sample_with_outputs": "the same with a belief at the rate output_rate_hz, µs",
     "peak_mb": "peak memory of the run above the memory before it, MB",
 }
 
@@ -112,6 +115,7 @@ class Scoring:
         segment_lengths_m: of the sub-trajectories.
         score_period_s: time between two scored beliefs; 1 ms or more.
         nees_epochs: number of evenly spaced times at which NEES is averaged over seeds (see `consistency`).
+        output_rate_hz: beliefs per second that every estimator is charged for, in `us_per_imu_sample_with_outputs`.
         nis: take the NIS of innovations, see `run_log`; costs are then not comparable.
         floor: compute the posterior Cramér–Rao bound of every output, for simulated logs, unaligned and in 3d.
         converged_deg: an attitude's error that stays below it has converged, see `fathom.bench.metrics.convergence`.
@@ -125,6 +129,7 @@ class Scoring:
     segment_lengths_m: tuple[Positive, ...] = (50.0, 100.0, 200.0, 400.0)
     score_period_s: Annotated[Number, Field(ge=1e-3, le=1e6)] = 1.0
     nees_epochs: Annotated[Whole, Field(ge=1, le=1000)] = 10
+    output_rate_hz: Annotated[Number, Field(ge=0, le=1e6)] = 10.0
     nis: bool = False
     floor: bool = False
     converged_deg: Annotated[Positive, Field(le=180)] | None = None
@@ -382,5 +387,15 @@ MEAN = (
 """Scores of which the mean over seeds is taken."""
 
 
-MEDIAN = ("step_median_us", "step_p99_us", "real_time_factor", "us_per_imu_sample", "peak_mb")
+MEDIAN = (
+    "step_median_us",
+    "step_cpu_median_us",
+    "step_p99_us",
+    "real_time_factor",
+    "us_per_imu_sample",
+    "us_per_imu_sample_with_outputs",
+    "total_s",
+    "cpu_s",
+    "peak_mb",
+)
 """Scores of which the median over seeds is taken: their outliers are the machine's."""

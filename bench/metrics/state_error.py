@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.special import gammainc
+from scipy.special import gammaincinv
 
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState, TimeArray
 from ...datasets.trajectory import Trajectory
@@ -131,7 +131,7 @@ def share_inside(nees: Array, dof: int, probability: float) -> float:
     Of a consistent Gaussian estimate it is the probability, on average; docs/conventions.md (64). NaNs are left out.
     """
     known = nees[~np.isnan(nees)]
-    return float((gammainc(0.5 * dof, 0.5 * known) <= probability).mean())
+    return float((known <= 2.0 * gammaincinv(0.5 * dof, probability)).mean())
 
 
 def not_positive(estimate: Trajectory) -> TimeArray:

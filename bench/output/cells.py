@@ -147,10 +147,18 @@ OTHERS = (
     Column("drift_max_percent", "largest drift", "%"),
     Column("outage_percent", "outage drift", "%"),
     Column("energy_score_m", "energy score", "m"),
+    Column("step_cpu_median_us", "step processor", "µs"),
     Column("us_per_imu_sample", "per IMU sample", "µs"),
+    Column("us_per_imu_sample_with_outputs", "with outputs", "µs"),
     Column("peak_mb", "peak memory", "MB"),
 )
 """What other tables and figures show."""
+
+COST = (
+    *("step_median_us", "step_cpu_median_us", "step_p99_us", "real_time_factor"),
+    *("us_per_imu_sample", "us_per_imu_sample_with_outputs", "peak_mb"),
+)
+"""The scores of the table of costs."""
 
 KNOWN = {column.score: column for column in (*ACCURACY, *OTHERS)}
 
@@ -204,7 +212,7 @@ def _reason(score: str, row: Record) -> str:
     if score in missing:
         return missing[score]
     if score in INNOVATIONS:
-        return "no innovations (smoothed, or no reading in time)"
+        return "no innovations (smoothed, or late readings that a smoother ties)"
     if score.startswith("over_floor_"):
         return missing.get(OVER[score.removeprefix("over_floor_")][1], "no floor of this output")
     return missing.get(score.replace("anees_", "nees_"), "not defined for this run")

@@ -10,6 +10,8 @@ from textwrap import shorten
 
 from ..results.summary import Record, ended_at_gap, groups
 
+LONGEST_WAIT = 1.1
+"""Of wall time over processor time: costs that differ by a tenth are told apart, so a tenth of waiting matters."""
 NO_CAUSE = "no cause is recorded"
 CAUSE_WIDTH = 400
 """Letters of a cause that are shown: what went wrong and what to do about it, on five lines of 80 columns."""
@@ -59,6 +61,24 @@ def mostly_outside(rows: Sequence[Record]) -> list[str]:
                 f"{row['log']}: {outside} of {readings} readings lay outside the log; correct the clock of their stream"
             )
     return list(lines.values())
+
+
+def waited(summary: Sequence[Record]) -> list[str]:
+    """Return a line for each log on which steps took longer than the processor worked on them."""
+    lines = []
+    for (log,), of_log in groups(summary, "log").items():
+        parted = {
+            row["label"]: row["total_s"] / row["cpu_s"]
+            for row in of_log
+            if row["cpu_s"] and row["total_s"] > LONGEST_WAIT * row["cpu_s"]
+        }
+        if parted:
+            lines.append(
+                f"{log}: the steps of {len(parted)} estimators took up to {max(parted.values()):.2g} times their "
+                f"processor time ({max(parted, key=lambda label: parted[label])}): the machine was busy, or threads "
+                "waited for one another; compare costs by cpu_s in table.csv, or run again with fewer --jobs"
+            )
+    return lines
 
 
 def not_positive(summary: Sequence[Record]) -> list[str]:

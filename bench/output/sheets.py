@@ -17,6 +17,7 @@ from ..results.summary import Record, groups
 from .cells import (
     ABSENT,
     ACCURACY,
+    COST,
     KNOWN,
     NEES_NOTE,
     ONLINE,
@@ -207,7 +208,7 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
         "squared errors over their covariance, per degree of freedom: 1 is consistent, more is overconfident",
         f"ANEES: over {seeds} runs, at {times} fixed times; ▲k, ▼k: at k of them above, below the chi-square interval"
         + ("" if seeds >= FEWEST_SEEDS else "; with so few seeds that interval is wide"),
-        ("NIS: over all readings that came in time; " if sensors else "")
+        ("NIS: over all readings in time, and late ones that a filter replays; " if sensors else "")
         + "position within 1, 2, 3 σ: 68, 95, 99.7 % if consistent",
     ]
 
@@ -306,15 +307,21 @@ def late_or_out(summary: Sequence[Record]) -> Sheet | None:
 
 def cost(summary: Sequence[Record]) -> Sheet | None:
     """Return what each estimator costs; None where none made a step."""
-    if not any(row[name] is not None for row in summary for name in MEDIAN):
+    if not any(row[name] is not None for row in summary for name in COST):
         return None
     lines = [
-        Line(label, [cell(name, row) for name in MEDIAN]) for (label,), (row, *_) in groups(summary, "label").items()
+        Line(label, [cell(name, row) for name in COST]) for (label,), (row, *_) in groups(summary, "label").items()
     ]
-    note = ["medians over runs; × real time: length of the log over the time of all steps and of the finish"]
+    rate = next((row["output_rate_hz"] for row in summary if row["output_rate_hz"] is not None), None)
+    note = [
+        "medians over runs; × real time: length of the log over the time of all steps and of the finish",
+        "step processor: time that the thread had the processor; less than the step where it waited",
+        "with outputs: time per IMU sample with "
+        + (f"{rate:g} beliefs a second" if rate is not None else "beliefs at a stated rate"),
+    ]
     if any(row[name] is not None for row in summary for name in NIS):
         note.append(NOT_COMPARABLE)
-    headings = ["estimator", *(column(name).heading for name in MEDIAN)]
+    headings = ["estimator", *(column(name).heading for name in COST)]
     return Sheet(f"{summary[0]['log']}: cost", note, headings, lines)
 
 

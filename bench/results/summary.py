@@ -112,7 +112,7 @@ def _summarise(every: Records) -> list[Record]:
         record |= {name: next((row[name] for row in group if row[name] is not None), None) for name in SAME}
         starts = dict.fromkeys(row["start"] for row in group if row.get("start") is not None)
         record |= {"start": " | ".join(starts) or None}
-        record |= _rpe_step(group)
+        record |= _stated(group)
         record |= {"runs": len(ends[log, label]), "done": len(done)}
         record |= {status: ends[log, label].count(status) for status in UNFINISHED}
         record |= {n: sum(row[n] or 0 for row in scored) for n in ("n_scored", "n_rpe")}
@@ -133,10 +133,10 @@ def ended_at_gap(row: Record) -> bool:
     return row["status"] == "failed" and (row.get("cause") or "").startswith(IMU_GAP)
 
 
-def _rpe_step(group: Sequence[Record]) -> Record:
-    """Return the step of a group's RPE, from its spec; None where that is not known."""
+def _stated(group: Sequence[Record]) -> Record:
+    """Return what the experiment states of RPE and outputs, from a group's spec; None where that is not known."""
     scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
-    return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs")}
+    return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs", "output_rate_hz")}
 
 
 def _missing(done: Sequence[Record]) -> dict[str, str]:

@@ -29,6 +29,8 @@ LAGS_S = (3.0, 10.0, 30.0)
 COLUMNS = (
     "estimator",
     "µs per IMU sample",
+    "of the processor",
+    "with 10 beliefs a second",
     *(f"ms per keyframe, lag {lag_s:g} s" for lag_s in LAGS_S),
     "whole log",
     "× real time",
@@ -42,7 +44,8 @@ def cost_records(rows: pd.DataFrame) -> list[Record]:
     """Return the cost of each estimator at each of its lags: medians over its runs, made one at a time.
 
     Each has `estimator`, `lag_s` (0: none; infinite: the whole log), `us_per_imu_sample`, `ms_per_keyframe` (None for
-    an estimator without keyframes), `real_time_factor`, `peak_mb`, `runs`. Steps and `finish` count, beliefs do not.
+    an estimator without keyframes), `real_time_factor`, `peak_mb`, `runs`. Steps and `finish` count, beliefs only in
+    `us_per_imu_sample_with_outputs`; `cpu_us_per_imu_sample` is processor time.
     """
     done = [row for row in records(rows) if row["status"] == "done" and row["total_s"] is not None]
     found = []
@@ -56,6 +59,8 @@ def cost_records(rows: pd.DataFrame) -> list[Record]:
                 "estimator": runs[0]["estimator"],
                 "lag_s": max(row["lookahead_s"] for row in of_label),
                 "us_per_imu_sample": median(row["us_per_imu_sample"] for row in runs),
+                "cpu_us_per_imu_sample": median(r["us_per_imu_sample"] * r["cpu_s"] / r["total_s"] for r in runs),
+                "us_per_imu_sample_with_outputs": _median([row["us_per_imu_sample_with_outputs"] for row in runs]),
                 "ms_per_keyframe": median(per_keyframe) if per_keyframe else None,
                 "real_time_factor": median(row["real_time_factor"] for row in runs),
                 "peak_mb": _median([row["peak_mb"] for row in runs]),
@@ -85,6 +90,8 @@ def cost_markdown(rows: pd.DataFrame) -> str:
                 [
                     f"`{name}`",
                     _figures(first["us_per_imu_sample"]),
+                    _figures(first["cpu_us_per_imu_sample"]),
+                    _figures(first["us_per_imu_sample_with_outputs"]),
                     *(_figures(by_lag.get(lag_s)) for lag_s in LAGS_S),
                     _figures(by_lag.get(math.inf)),
                     _figures(first["real_time_factor"]),
@@ -115,7 +122,8 @@ def _conditions(rows: pd.DataFrame, costs: Sequence[Record]) -> str:
     return (
         f"{machines}; one thread, one run at a time. Median of {max(r['runs'] for r in costs)} seeds of {logs}; "
         "compiled before. Steps and `finish`, all divided by IMU samples, or by keyframes; what is not by lag is at "
-        f"{LAGS_S[0]:g} s. Memory is what the run adds to the process at its peak."
+        f"{LAGS_S[0]:g} s. With beliefs: every estimator is "
+        "charged for as many. Memory is what the run adds to the process at its peak."
     )
 
 

@@ -21,7 +21,7 @@ from ...datasets.quantities import NotNegative, Whole
 from ...datasets.rig import Rig
 from ...datasets.state import Array, Belief
 from ...datasets.trajectory import Trajectory
-from ..interface import FACTORS, OUTLIERS, Diverged, Factors, Gate, Inflation
+from ..interface import FACTORS, MERGE_NS, OUTLIERS, Diverged, Factors, Gate, Inflation
 from ..physics.imu import BLOCK, EarthRotation, compile_rig, first_sample, split
 from ..physics.innovation import INNOVATION, gate_widths, judge
 from ..physics.state import as_belief, as_record, with_rate_noise
@@ -48,7 +48,7 @@ class FilterOptions:
     inflate: Inflation = Field(default_factory=dict)
     gate: Gate = Field(default_factory=dict)
     max_delay_s: NotNegative = 5.0
-    merge_ns: Whole = Field(default=1_000_000, ge=0)
+    merge_ns: Whole = Field(default=MERGE_NS, ge=0)
     earth_rotation: EarthRotation = "auto"
 
 
@@ -125,6 +125,8 @@ class FilterPass:
         self._block = np.zeros(1, BLOCK)
         self._past: deque[PastEpoch] = deque()
         self._kalman = kalman
+        self._watched: list[NDArray[Any]] | None = None
+        self._inserted: set[tuple[int, int]] = set()  # kind and time of the late readings of this replay
         self._is_lost = not knows_heading(self._own_belief())
 
     @property
@@ -141,6 +143,7 @@ class FilterPass:
             if age_ns[0] > self._config.merge_ns:
                 epoch = self._replay(epoch)
         self._advance(epoch)
+        self._inserted = set()
 
     def belief(self) -> Belief:
         """See `Pass.belief`."""
@@ -149,6 +152,14 @@ class FilterPass:
     def finish(self) -> Trajectory | None:
         """Return None: a filter does not smooth."""
         return None
+
+    def watch_late(self) -> list[NDArray[Any]]:
+        """Return a list that gets the INNOVATION rows of the late readings from now on, as each is replayed.
+
+        Each is judged against the state predicted for its own time, by all that was true before it.
+        """
+        self._watched = []
+        return self._watched
 
     def _advance(self, epoch: Epoch) -> None:
         """Predict to the end of the epoch, correct by its readings, and keep it for replay."""
@@ -166,6 +177,9 @@ class FilterPass:
         readings = epoch.readings
         if self._is_lost and len(readings):
             self._look_for_heading(readings)
+        if self._inserted and self._watched is not None and len(readings):
+            late = [(int(one["kind"]), int(one["t_ns"])) in self._inserted for one in readings]
+            self._watched.append(self._judged(readings[late]))
         if self._widths is not None and len(readings):
             readings = self._gated(readings, self._widths, outliers)
             self.counts.update(outliers)
@@ -194,14 +208,20 @@ class FilterPass:
 
     def _gated(self, readings: NDArray[Any], widths: Array, outliers: Counter[str]) -> NDArray[Any]:
         """Return the readings that pass their gates, and count the others as outliers."""
-        predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
-        predicted["P"][0] = self._covariance(self._state)
-        judge(readings, predicted, self._rig, table)
+        table = self._judged(readings)
         beyond = table["nis"] > widths[readings["kind"], table["dof"]]
         if not beyond.any():
             return readings
         outliers.update(OUTLIERS + SENSOR[kind] for kind in readings["kind"][beyond].tolist())
         return readings[~beyond]
+
+    def _judged(self, readings: NDArray[Any]) -> NDArray[Any]:
+        """Return INNOVATION rows of readings of the present time, given the state before them."""
+        predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
+        predicted["P"][0] = self._covariance(self._state)
+        table["kind"], table["t_ns"] = readings["kind"], readings["t_ns"]
+        judge(readings, predicted, self._rig, table)
+        return table
 
     def _replay(self, epoch: Epoch) -> Epoch:
         """Rewind, and replay with the late readings of the epoch inserted; return the epoch without them."""
@@ -225,6 +245,7 @@ class FilterPass:
                 self.counts.subtract(self._past.pop().outliers)
             for reading in reachable:
                 again = _insert(again, reading)
+            self._inserted = {(int(reading["kind"]), int(reading["t_ns"])) for reading in reachable}
             for replayed in again[:-1]:
                 self._advance(replayed)
             return again[-1]

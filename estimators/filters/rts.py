@@ -77,6 +77,10 @@ class RauchTungStriebelPass:
         """See `Pass.belief`."""
         return self._forwards.belief()
 
+    def watch_late(self) -> list[NDArray[Any]]:
+        """See `FilterPass.watch_late`."""
+        return self._forwards.watch_late()
+
     def finish(self) -> Trajectory | None:
         """Return the smoothed states at the ticks; the memory of the forward pass is freed page by page."""
         beliefs: list[Belief] = []

@@ -11,7 +11,8 @@ import pytest
 from fathom.datasets import Scenario, simulate
 from fathom.datasets.epochs import DEPTH, DVL, GPS, HEADING, READING, cut
 from fathom.datasets.simulated.specs import DvlSpec, GpsSpec, HeadingSpec
-from fathom.estimators import create
+from fathom.estimators import ESTIMATORS, create
+from fathom.estimators.interface import MERGE_NS
 from fathom.estimators.keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, LONGEST_SILENCE_S, SOLVE, SUMMED, Keyframes
 from fathom.estimators.smoothers import GraphSmoother
 from hypothesis import given, settings
@@ -22,7 +23,14 @@ ALL = np.ones(5)
 
 
 def keyframes(**options: Any) -> Keyframes:
-    return Keyframes(create("window", **options), ALL, 0)
+    return Keyframes(create("window", **({"merge_ns": 5 * MS} | options)), ALL, 0)
+
+
+def test_filters_and_smoothers_move_readings_by_the_same_time() -> None:
+    every: dict[str, Any] = {name: create(name) for name in ESTIMATORS}
+    merging = {name: config.merge_ns for name, config in every.items() if hasattr(config, "merge_ns")}
+    assert {"eskf", "rts", "window", "fls", "batch"} <= merging.keys()
+    assert set(merging.values()) == {MERGE_NS}
 
 
 def received(*readings: tuple[int, int], sigma: float = 1.0) -> np.ndarray:

@@ -16,7 +16,7 @@ from ...files import write_whole, writing
 from ...results.store import load_runs
 from ...results.summary import Record, Rows, groups, records, summarise
 from .. import cells, notices, sheets
-from ..remarks import mostly_outside, not_positive
+from ..remarks import mostly_outside, not_positive, waited
 from . import curves, runs
 from .packing import embedded, packed, packed_text
 from .results import differences_of, in_order, kept_plan
@@ -132,7 +132,7 @@ def render(rows: Rows, folder: Path, differences: Sequence[Record]) -> str:
         facts=runs.facts(every),
         failures=runs.failures(every),
         noticed=notices.sheet(every),
-        warnings=[*mostly_outside(every), *not_positive(summary), *_mixed(every), *_missing(drawn)],
+        warnings=[*mostly_outside(every), *not_positive(summary), *waited(summary), *_mixed(every), *_missing(drawn)],
         accuracy=[sheets.accuracy(of, done) for of in by_log.values()],
         over_floor=_there(map(sheets.over_floor, by_log.values())),
         differences=sheets.differences(differences),

@@ -24,7 +24,7 @@ from ...results.summary import consistency as consistency_of
 from ...saying import folded
 from .. import notices, over_logs, sheets
 from ..cells import Cell
-from ..remarks import failures, mostly_outside, not_positive
+from ..remarks import failures, mostly_outside, not_positive, waited
 from . import terminal
 
 LETTERS = 80
@@ -106,6 +106,8 @@ def print_remarks(rows: Rows, console: Console) -> None:
     every = records(rows)
     for line in failures(every) + mostly_outside(every) + not_positive(summarise(every)):
         _print_line(line, "red", console)
+    for line in waited(summarise(every)):
+        _print_line(line, "yellow", console)
     for line, routine in notices.lines(every):
         _print_line(line, "dim" if routine else "yellow", console)
 

@@ -274,6 +274,13 @@ def test_costs_add_up(log: Log) -> None:
     assert row["total_s"] == pytest.approx(result.step_ns.sum() * 1e-9 + result.finish_ns * 1e-9)
     assert row["real_time_factor"] == pytest.approx(30.0 / row["total_s"])
     assert row["us_per_imu_sample"] == pytest.approx(1e6 * row["total_s"] / 3000)
+    assert result.step_cpu_ns.shape == result.step_ns.shape
+    assert row["cpu_s"] < 0.5 * row["total_s"]  # a sleeping thread does not work
+    assert row["step_cpu_median_us"] == pytest.approx(np.median(result.step_cpu_ns) / 1e3)
+    outputs_s = 30.0 * 50 * result.belief_ns.mean() * 1e-9
+    charged = costs(result, 50.0)["us_per_imu_sample_with_outputs"]
+    assert charged == pytest.approx(1e6 * (row["total_s"] + outputs_s) / 3000)
+    assert costs(result, 0.0)["us_per_imu_sample_with_outputs"] == row["us_per_imu_sample"]
     assert 1000 <= row["step_median_us"] <= row["step_p99_us"] <= row["step_max_us"]
 
 
@@ -403,6 +410,29 @@ def test_readings_that_come_late_are_counted_and_not_judged(log: Log) -> None:
     heard = sum(int((s.received_ns <= late.imu.t_ns[-1]).sum()) for s in (late.dvl, late.gps))
     assert result.counts["nis_late"] == heard > 100
     assert result.counts["nis_undefined"] == 0
+
+
+@pytest.mark.parametrize("name", ["eskf", "iekf", "rts"])
+def test_late_readings_are_judged_where_they_are_replayed(name: str) -> None:
+    late = simulate(Scenario(duration_s=30.0, surface_for_s=30.0, **DELAYED), seed=3)
+    result, plain = run_log(late, create(name), nis=True), run_log(late, create(name))
+    dof = innovation_dof(result)
+    heard = {name: int((late.streams[name].received_ns <= late.imu.t_ns[-1]).sum()) for name in ("dvl", "gps")}
+    assert {name: dof[name] for name in heard} == {name: 3 * n for name, n in heard.items()}  # each of them, once
+    assert (result.counts["nis_late"], result.counts["nis_undefined"]) == (0, 0)
+    assert (np.diff(result.nis["t_ns"]) >= 0).all()
+    row = innovation_scores(result)
+    for sensor, n in dof.items():
+        low, high = chi2.interval(1 - 1e-4, n)
+        assert low < row[f"nis_{sensor}"] * n < high, sensor
+    assert np.abs(result.online.p_WB_W - plain.online.p_WB_W).max() < 1e-9
+
+
+def test_a_reading_too_late_to_be_replayed_is_counted_and_not_judged() -> None:
+    late = simulate(Scenario(duration_s=30.0, **DELAYED), seed=3)
+    result = run_log(late, create("eskf", max_delay_s=0.5), nis=True)
+    assert innovation_dof(result).keys() == {"dvl", "depth", "heading"}
+    assert result.counts["nis_late"] == result.counts["late"] > 0
 
 
 def test_a_belief_under_which_no_reading_is_possible_is_counted(log: Log) -> None:

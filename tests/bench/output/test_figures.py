@@ -316,7 +316,7 @@ def test_late_readings_and_outliers_are_counted(judged: tuple[pd.DataFrame, Path
     rows, _ = judged
     text = printed(rows, tmp_path, 120)
     late = text[text.index("late readings and outliers") :].splitlines()
-    fixes = sum(json.loads(counts)["nis_late"] for counts in rows[rows["label"] == "eskf"]["counts"])
+    fixes = sum(json.loads(counts)["readings_late"] for counts in rows[rows["label"] == "eskf"]["counts"])
     assert fixes > 50
     assert next(line.split() for line in late if line.startswith("eskf"))[2:] == [str(fixes), "0", "0"]
     gated = printed(rows.assign(counts='{"readings": 1000, "late": 3, "outliers_dvl": 20}'), tmp_path, 120)
