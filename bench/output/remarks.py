@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from textwrap import shorten
 
 from ..results.summary import Record, ended_at_gap, groups
+from .cells import spans
 
 LONGEST_WAIT = 1.1
 """Of wall time over processor time: costs that differ by a tenth are told apart, so a tenth of waiting matters."""
@@ -20,22 +21,25 @@ CAUSE_WIDTH = 400
 def failures(rows: Sequence[Record]) -> list[str]:
     """Return a line for each run that did not finish; a recording that is not here has one line in all.
 
-    The first with a traceback, by label and cause, says where it ends.
+    Seeds that ended by the same cause share a line, which says when the first of them did. The first line with a
+    traceback, by label and cause, says where it ends.
     """
     lines, placed = [], set()
-    for (log, label, seed), (row, *_) in groups(rows, "log", "label", "seed").items():
-        if row["status"] == "absent":
-            lines.append(absence(log, row["cause"]))
-        elif row["status"] != "done":
-            of_seed = "" if seed is None else f" seed {seed}"
-            when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
-            part = "; scored up to there" if ended_at_gap(row) else ""
-            kind, place = (label, row["cause"]), ""
-            if row["traceback"] and kind not in placed:
-                placed.add(kind)
-                place = f" ({_place(row['traceback'])}; the column `traceback` of runs.sqlite has all)"
-            why = shorten(row["cause"] or NO_CAUSE, CAUSE_WIDTH)
-            lines.append(f"{log} / {label}{of_seed}: {row['status']}{when}: {why}{part}{place}")
+    ended = (row for row, *_ in groups(rows, "log", "label", "seed").values() if row["status"] != "done")
+    for (log, label, status, cause), of in groups(ended, "log", "label", "status", "cause").items():
+        if status == "absent":
+            lines.append(absence(log, cause))
+            continue
+        row, seeds = of[0], sorted(int(row["seed"]) for row in of if row["seed"] is not None)
+        of_seed = f" seed{'s' if len(seeds) > 1 else ''} {spans(seeds)}" if seeds else ""
+        when = "" if row["failed_at_s"] is None else f" at {row['failed_at_s']:.1f} s"
+        part = "; scored up to there" if ended_at_gap(row) else ""
+        kind, place = (label, cause), ""
+        if row["traceback"] and kind not in placed:
+            placed.add(kind)
+            place = f" ({_place(row['traceback'])}; the column `traceback` of runs.sqlite has all)"
+        why = shorten(cause or NO_CAUSE, CAUSE_WIDTH)
+        lines.append(f"{log} / {label}{of_seed}: {status}{when}: {why}{part}{place}")
     return list(dict.fromkeys(lines))
 
 

@@ -34,6 +34,14 @@ def test_beside_finished_runs_they_do_not_count() -> None:
     assert (summary["ate_rmse_m"], summary["done"]) == (1.0, 1)
 
 
+def test_seeds_that_ended_alike_share_a_line() -> None:
+    refused = [row(seed, "failed", 3.0, "the heading is unknown") for seed in range(1, 51)]
+    alike, other = failures(records(table(*refused, row(51, "failed", 4.0, "out of time"), row(52, "done", 1.0))))
+    assert "seeds 1–50: failed" in alike
+    assert alike.endswith("the heading is unknown")
+    assert "seed 51: failed" in other
+
+
 def test_the_remark_says_that_the_score_is_of_a_part() -> None:
     gap, late = failures(records(table(row(1, "failed", 3.0, GAP), row(2, "failed", 4.0, "out of time"))))
     assert gap.endswith(f"{GAP}; scored up to there")
