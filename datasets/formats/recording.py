@@ -25,6 +25,7 @@ from ..files import inside
 LOADERS = {
     "ardupilot": "ardupilot:ArduPilotRecording",
     "imc": "imc:ImcRecording",
+    "jsonlines": "json_lines:JsonLinesRecording",
     "mcap": "mcap_file:McapRecording",
     "ros": "ros_bag:RosRecording",
 }
