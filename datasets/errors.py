@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import difflib
 import re
+import signal
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import NoneType, UnionType
@@ -69,6 +72,43 @@ def message_of(error: BaseException) -> str:
 def one_line(error: BaseException) -> str:
     """Return the class and the message of an error, on one line, as `shown` does."""
     return f"{shown(type(error).__name__)}: {message_of(error)}".rstrip()
+
+
+LOAD_S = 60.0
+"""How long another package's code may take to be imported or configured, s; large libraries take ten from a disk."""
+
+
+@contextmanager
+def given_up_after(seconds: float) -> Iterator[None]:
+    """Interrupt Python code inside that takes longer; not in a thread, on Windows, or within one call of compiled code.
+
+    Raises:
+        TimeoutError: inside, and again every second, as code may catch it.
+    """
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        raise TimeoutError(f"not done after {seconds:g} s, and given up")
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL if before is None else before)
+
+
+def load(point: EntryPoint) -> Any:
+    """Return what an entry point of an installed package names.
+
+    Raises:
+        Exception, SystemExit: anything, as importing a foreign module may; TimeoutError after LOAD_S.
+    """
+    with given_up_after(LOAD_S):
+        return point.load()
 
 
 def not_loaded(point: EntryPoint, error: BaseException) -> str:

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic.dataclasses import is_pydantic_dataclass
 from pydantic.errors import PydanticUserError
 
-from ..datasets.errors import FathomError, complaints, nearest, not_loaded, one_line
+from ..datasets.errors import LOAD_S, FathomError, complaints, given_up_after, load, nearest, not_loaded, one_line
 from .batch import BatchSmoother
 from .contract import PAGE, check_estimator
 from .dead_reckoning import DeadReckoning
@@ -80,7 +80,7 @@ def load_estimator(name: str) -> Any:
     point = _plugins()[name]
     try:
         with process_kept():
-            return point.load()
+            return load(point)
     except (Exception, SystemExit) as error:  # importing another package's module may raise anything, or exit
         raise EstimatorError(f"{name}: {not_loaded(point, error)}") from error
 
@@ -137,7 +137,7 @@ def _of_other_package(kind: type, options: Mapping[str, Any]) -> Estimator:
     Raises:
         Exception: anything.
     """
-    with process_kept():
+    with process_kept(), given_up_after(LOAD_S):
         estimator = kind(**_converted(kind, options))
         check_estimator(estimator)
         return estimator

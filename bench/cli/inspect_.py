@@ -19,7 +19,7 @@ def inspect(
         typer.Argument(
             metavar="LOG",
             help="Name of a recorded log, a folder with a log.yaml, or a description (.yaml). Of a bare recording "
-            "(.bag, .db3, .mcap, .bin, .lsf) the messages are listed.",
+            "(.bag, .db3, .mcap, .jsonl, .bin, .lsf) the messages are listed.",
         ),
     ],
     data: Data = None,

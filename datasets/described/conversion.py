@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import DatasetError
 from ..files import inside
-from ..formats.parquet import read_known
-from ..formats.text_table import EXACT
+from ..formats.tables.parquet import read_known
+from ..formats.tables.text_table import EXACT
 from ..log import AttitudeStream, DepthStream, DvlStream, GpsStream, HeadingStream, Log
 from ..notes import Note
 from ..rig import Rig

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, ValidationError, model_va
 
 from ..errors import DatasetError, complaints, nearest
 from ..formats.recording import Recording, loader
-from ..formats.table import Column, Part, Table
+from ..formats.tables.table import Column, Part, Table
 from ..formats.yaml_file import read_yaml
 from ..mounting import Matrix, MountingSpec
 from ..notes import Note

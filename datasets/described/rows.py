@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..formats.table import Columns, Flaws
+from ..formats.tables.table import Columns, Flaws
 from ..log import is_noise
 from ..notes import Note
 from ..state import LIMIT_NS, Array, TimeArray

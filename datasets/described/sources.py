@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from ..formats.columns import read_table
 from ..formats.recording import Recording, Wanted
-from ..formats.table import Columns, Flaws
+from ..formats.tables.columns import read_table
+from ..formats.tables.table import Columns, Flaws
 from ..notes import Note
 from ..state import Array, TimeArray
 from ..times import NS_PER

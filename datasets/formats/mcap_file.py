@@ -6,12 +6,10 @@ the recorder lost its power.
 
 from __future__ import annotations
 
-import json
 import struct
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import cache
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 from zlib import crc32
@@ -20,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError, one_line
+from .json_lines import JsonExtractor
 from .recording import extra, not_found
 from .ros_messages import Definitions, Types, definitions_of, ros_channel, short_name
 from .topics import NS, Channel, MalformedMessage, Message, ScanResult, ShortArray, TopicRecording
@@ -366,84 +365,3 @@ def _protobuf_value(message: Any, column: str, steps: Path_, code: str) -> Any:
                 raise ShortArray(column, len(value))
             value = value[index]
     return value.seconds * NS + value.nanos if code == "time" else value
-
-
-# -------------------------------------------------------------------------------------------------------------- JSON
-
-
-class JsonExtractor:
-    """Extracts wanted numbers from JSON objects; an `Extractor`. An absent number, or null, is NaN."""
-
-    def __init__(self, wanted: Sequence[str], where: str) -> None:
-        self._wanted, self._where = tuple(wanted), where
-        self._paths = [column.split(".") for column in wanted]
-        self._met: set[str] = set()
-        self._shape: Mapping[str, Any] | None = None
-        self.codes = ["q" for _ in wanted]
-
-    def __call__(self, data: bytes) -> list[Any]:
-        """Return the numbers, in the order of the columns."""
-        try:
-            message = json.loads(data)
-        except (ValueError, RecursionError) as error:
-            raise MalformedMessage(f"not JSON: {error}") from None
-        if not isinstance(message, dict):
-            raise MalformedMessage(f"not an object but {type(message).__name__}")
-        if self._shape is None:
-            self._shape = message
-        return [self._value(message, column, path) for column, path in zip(self._wanted, self._paths, strict=True)]
-
-    def columns(self, raw: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Return the columns by name.
-
-        Raises:
-            DatasetError: a column that no message has.
-        """
-        for column in self._wanted:
-            if column not in self._met:
-                raise not_found(
-                    self._where,
-                    "numeric field called",
-                    column,
-                    islice(_json_fields(self._shape or {}, "", 0), MOST_FIELDS),
-                )
-        return dict(zip(self._wanted, raw, strict=True))
-
-    def _value(self, message: Any, column: str, path: Sequence[str]) -> int | float:
-        value = message
-        for name in path:
-            if isinstance(value, dict):
-                value = value.get(name)
-            elif isinstance(value, list) and name.isascii() and name.isdecimal():
-                if int(name) >= len(value):
-                    raise ShortArray(column, len(value))
-                value = value[int(name)]
-            else:
-                return np.nan
-        number = _json_number(value)
-        if number is not None:
-            self._met.add(column)
-            return number
-        if value is not None:
-            raise MalformedMessage(f"{column!r} is no number")
-        return np.nan
-
-
-def _json_number(value: Any) -> int | float | None:
-    """Return a number, or the nanoseconds of a time; None if it is neither."""
-    if isinstance(value, int | float):
-        return value if isinstance(value, float) else int(value)
-    if isinstance(value, dict):
-        seconds, nanoseconds = value.get("sec"), value.get("nsec", value.get("nanosec"))
-        if len(value) == 2 and isinstance(seconds, int) and isinstance(nanoseconds, int):
-            return seconds * NS + nanoseconds
-    return None
-
-
-def _json_fields(value: Any, prefix: str, level: int) -> Iterator[str]:
-    items = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
-    for name, inner in items:
-        if _json_number(inner) is not None:
-            yield f"{prefix}{name}"
-        elif level < MOST_LEVELS:
-            yield from _json_fields(inner, f"{prefix}{name}.", level + 1)

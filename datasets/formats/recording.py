@@ -19,12 +19,13 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from ..errors import DatasetError, nearest, not_loaded
+from ..errors import DatasetError, load, nearest, not_loaded
 from ..files import inside
 
 LOADERS = {
     "ardupilot": "ardupilot:ArduPilotRecording",
     "imc": "imc:ImcRecording",
+    "jsonlines": "json_lines:JsonLinesRecording",
     "mcap": "mcap_file:McapRecording",
     "ros": "ros_bag:RosRecording",
 }
@@ -137,7 +138,7 @@ def loader(name: object) -> type[Recording]:
         raise DatasetError(f"no format {name!r}{nearest(str(name), known)} (known: {', '.join(known)})")
     point = _plugins()[str(name)]
     try:
-        return point.load()
+        return load(point)
     except Exception as error:  # importing a foreign module may raise anything
         raise DatasetError(f"format {name!r}: {not_loaded(point, error)}") from error
 

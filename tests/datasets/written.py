@@ -292,6 +292,17 @@ def _protobuf(log: Log, stream: Any, _: str, options: dict[str, Any]) -> None:
             writer.write_message(f"/{name}", message, log_time=received_ns, publish_time=received_ns)
 
 
+def write_json_lines(log: Log, folder: Path) -> Path:
+    """Write a file with one JSON object a line."""
+    paths = {"stamp": "stamp", "gyro": [f"gyro.{i}" for i in range(3)], "accel": [f"accel.{i}" for i in range(3)]}
+    describe(log, folder, {"format": "jsonlines", "file": "log.jsonl"}, {**paths, "z": "z", "sigma": "sigma"})
+    with (folder / "log.jsonl").open("w") as file:
+        for name, (t_ns, received_ns, first, second) in in_time_order(log):
+            values = {"gyro": first, "accel": second} if name == "imu" else {"z": first, "sigma": second}
+            file.write(json.dumps({"type": f"/{name}", "stamp": t_ns, "log_time": received_ns, **values}) + "\n")
+    return folder
+
+
 WRITERS: dict[str, Callable[[Log, Path], Path]] = {
     "ros1": write_ros1,
     "ros2-sqlite": lambda log, folder: write_ros2(log, folder, "sqlite3"),
@@ -299,6 +310,7 @@ WRITERS: dict[str, Callable[[Log, Path], Path]] = {
     "mcap-protobuf": lambda log, folder: write_mcap(log, folder, "protobuf"),
     "mcap-ros2": lambda log, folder: write_mcap(log, folder, "ros2"),
     "mcap-ros1": lambda log, folder: write_mcap(log, folder, "ros1"),
+    "jsonlines": write_json_lines,
     "mcap-json": lambda log, folder: write_mcap(log, folder, "json"),
 }
 """Every format that holds a log bit for bit: a float64 stays one, and so does a nanosecond."""

@@ -185,6 +185,28 @@ def test_a_package_that_exits_when_imported_ends_nothing(site: Path) -> None:
         create("leaver")
 
 
+SLOW = """
+import time
+from dataclasses import dataclass
+@dataclass(frozen=True)
+class Slow:
+    def __post_init__(self):
+        time.sleep(60)
+"""
+
+
+def test_a_package_that_hangs_when_imported_or_configured_is_given_up(
+    site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(site, "stuck", "import time\ntime.sleep(60)\n", stuck="Stuck")
+    install(site, "slow", SLOW, slow="Slow")
+    monkeypatch.setattr("fathom.datasets.errors.LOAD_S", 0.1)
+    monkeypatch.setattr("fathom.estimators.registry.LOAD_S", 0.1)
+    for name in ("stuck", "slow"):
+        with pytest.raises(EstimatorError, match=rf"{name}: .*TimeoutError: not done after 0\.1 s, and given up"):
+            create(name)
+
+
 MEDDLES = """
 import locale, os, signal, sys, warnings
 import numpy as np

@@ -11,7 +11,7 @@ from ....datasets.state import Array, TimeArray
 from ..findings.advice import DEPTH_OFFSET
 from ..findings.finding import Check, Finding
 from ..findings.fitting import Index, Mask
-from ..streams.channels import seconds
+from ..streams.channels import seconds, stated_sigma
 from .sketch import SILENT_S, Sketch, sketch_of
 
 ZERO_M = 1.5
@@ -165,7 +165,7 @@ def _by_truth(sketch: Sketch) -> float | None:
 
 def _noise_m(depth: DepthStream) -> float:
     """Return what noise explains of a difference of heights, m."""
-    return NOISES * float(np.median(depth.sigma[:: max(len(depth) // MOST, 1)]))
+    return NOISES * float(stated_sigma(depth)[0])
 
 
 def _quantiles(x: Array) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ from ....datasets.quantities import DEGREE
 from ....datasets.times import NS_PER
 from ..findings.finding import Finding
 from ..findings.fitting import MAD_TO_SIGMA
-from ..streams.channels import imu_period_ns
+from ..streams.channels import imu_period_ns, stated_sigma
 
 SLOWEST_IMU_HZ = 2.0
 """Below this an IMU's samples say nothing of a vehicle's motion between them: its time is in another unit."""
@@ -69,7 +69,7 @@ def sigma_findings(log: Log) -> list[Finding]:
             continue
         least, largest, unit = BOUNDS[name]
         shown = 1 / DEGREE if name == "heading" else 1.0
-        sigma = np.median(stream.sigma, axis=0)
+        sigma = stated_sigma(stream)
         sigma = sigma[np.isfinite(sigma)]
         key = f"streams.{name}." + {"dvl": "sigma_m_s", "heading": "sigma_deg"}.get(name, "sigma_m")
         scatter, most = _scatter(stream)

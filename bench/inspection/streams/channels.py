@@ -102,8 +102,14 @@ def channels_of(log: Log) -> tuple[Channel, ...]:
     )
 
 
+@lru_cache(maxsize=4)
+def stated_sigma(stream: ReadingStream) -> Array:
+    """Return the median (m,) of the sigmas that a stream states, of each component; several checks ask for it."""
+    return np.median(stream.sigma, axis=0)
+
+
 def _aiding(name: str, stream: ReadingStream) -> Channel:
-    sigma = np.median(stream.sigma, axis=0)
+    sigma = stated_sigma(stream)
     if name == "heading":
         x, turn, axes = np.unwrap(stream.z, axis=0), 2 * np.pi, ("",)
         if isinstance(stream, AttitudeStream):

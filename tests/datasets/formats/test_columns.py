@@ -16,10 +16,10 @@ import pyarrow.parquet as pq
 import pytest
 from fathom.datasets import DatasetError, Log, Trajectory
 from fathom.datasets.described.opening import CATALOG, open_log
-from fathom.datasets.formats import columns as module
-from fathom.datasets.formats import text_table
-from fathom.datasets.formats.columns import read_table
-from fathom.datasets.formats.table import Table
+from fathom.datasets.formats.tables import columns as module
+from fathom.datasets.formats.tables import text_table
+from fathom.datasets.formats.tables.columns import read_table
+from fathom.datasets.formats.tables.table import Table
 from fathom.datasets.times import times_ns
 from hypothesis import given
 from hypothesis import strategies as st
@@ -166,8 +166,8 @@ MEASURE = """
 import resource, sys
 from pathlib import Path
 import numpy as np, pandas as pd
-from fathom.datasets.formats.columns import read_table
-from fathom.datasets.formats.table import Table
+from fathom.datasets.formats.tables.columns import read_table
+from fathom.datasets.formats.tables.table import Table
 from fathom.datasets.times import times_ns
 folder, name = Path(sys.argv[1]), sys.argv[2]
 form = Table(file=name)

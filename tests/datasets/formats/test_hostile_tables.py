@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 from fathom.datasets import DatasetError, Trajectory
 from fathom.datasets.described.conversion import _read_trajectory
-from fathom.datasets.formats.columns import read_table
-from fathom.datasets.formats.table import Table
+from fathom.datasets.formats.tables.columns import read_table
+from fathom.datasets.formats.tables.table import Table
 from limited import limited
 
 MEGABYTES = 200

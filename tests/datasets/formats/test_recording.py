@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -154,6 +155,18 @@ def test_what_is_wrong_with_a_recording_is_named(installed, changes, error):
     with pytest.raises(DatasetError, match=error) as caught:
         open_log(described(installed, **changes))
     assert str(caught.value).startswith(str(installed))
+
+
+def test_a_package_that_hangs_on_import_is_given_up(installed, monkeypatch):
+    """Also where it catches the interruption once."""
+    hangs = "import time\ntry:\n    time.sleep(60)\nexcept Exception:\n    time.sleep(60)\n"
+    distribution(installed / "site", "stuck", "[fathom.loaders]\nstuck = stuck_format:Stuck\n", stuck_format=hangs)
+    monkeypatch.setattr("fathom.datasets.errors.LOAD_S", 0.1)
+    before = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(DatasetError, match=r"'stuck'.*TimeoutError: not done after 0\.1 s, and given up"):
+        open_log(described(installed, format="stuck"))
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 def test_a_recording_must_be_keys_and_values(installed):

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..errors import DatasetError
-from ..files import inside
+from ...errors import DatasetError
+from ...files import inside
 from .parquet import check_size, unpacked
 from .table import Column, Columns, Flaws, Table, check_columns, short
 from .text_table import PIECE_BYTES, PIECE_ROWS, text_pieces

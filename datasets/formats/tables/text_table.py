@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 import pandas as pd
 
-from ..errors import DatasetError
+from ...errors import DatasetError
 from .table import Column, Flaws, Table, check_columns
 
 EXACT: dict[str, Any] = (

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ..errors import DatasetError, nearest
+from ...errors import DatasetError, nearest
 
 LONGEST_TEXT = 400
 """Characters of a field, so that a Parquet file with one text of megabytes in every row needs little memory."""

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from ..errors import DatasetError
-from ..times import DAY_NS, NS_PER
+from ...errors import DatasetError
+from ...times import DAY_NS, NS_PER
 from .table import short
 
 if TYPE_CHECKING:
