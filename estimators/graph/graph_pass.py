@@ -70,9 +70,7 @@ class Keyframe:
 class GraphPass:
     """One pass of a smoother on GTSAM."""
 
-    def __init__(
-        self, config: GraphSmoother, solver: Solver, prior: Belief, rig: Rig, imu_factor: ImuFactor = "gtsam"
-    ) -> None:
+    def __init__(self, config: GraphSmoother, solver: Solver, prior: Belief, rig: Rig, imu_factor: ImuFactor) -> None:
         self._config, self._imu_factor = config, imu_factor
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._R_BI = rig.imu.R_BS

@@ -22,14 +22,14 @@ from ...datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, SENSOR
 from ...datasets.errors import message_of
 from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOCITY, Array, NavState
 from ..interface import Diverged, unknown_kind
-from ..physics.blocks import TOP, identity, rows_times, set_block
+from ..physics.blocks import TOP, identity, rows_times
 from ..physics.dvl_preintegration import given_rotation
 from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, rate_at_end, unbiased
+from ..physics.invariant import invariant_after_error, local_invariant, spread_velocity, to_invariant
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import (
     cross_into,
     exp_into,
-    inverse_right_jacobian_into,
     inverse_transform_into,
     log,
     log_into,
@@ -39,7 +39,7 @@ from ..physics.so3 import (
     right_jacobian_into,
     transform_into,
 )
-from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, THETA_0, VELOCITY_0, local
+from ..physics.state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, STATE, THETA_0, VELOCITY_0
 from ..stages import stage, staged
 
 Linearised: TypeAlias = tuple[Array, ...]
@@ -379,25 +379,28 @@ def tight_displacement_factor(i: int, j: int, displacement: NDArray[Any], rig: N
 def _linearise_prior(
     mean: NDArray[Any], pose: Array, v_WB_W: Array, bias: Array, R_BI: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return r (15,) = state ⊖ mean, and its Jacobians by the pose, velocity and bias."""
-    r, H, J, state = np.empty(DIM), np.empty((DIM, DIM)), np.empty((3, 3)), np.empty(1, STATE)
+    """Return r (15,), the invariant error of the state from the mean; and its Jacobians by pose, velocity and bias."""
+    r, H, state = np.empty(DIM), np.empty((DIM, DIM)), np.empty(1, STATE)
     fill_state(pose, v_WB_W, bias, R_BI, state)
-    local(mean, state, r)
-    identity(H)
-    inverse_right_jacobian_into(r[THETA], J)
-    set_block(H, THETA_0, THETA_0, 1.0, J)
+    local_invariant(mean, state, r)
+    invariant_after_error(state, r, H)
     H_x, H_v, H_b = by_gtsam(len(H), H, pose, R_BI)
     return r, H_x, H_v, H_b
 
 
 @stage("linearisation")
 def prior_factor(prior: NDArray[Any], rig: NDArray[Any]) -> gtsam.CustomFactor:
-    """Return the prior (a STATE record, its whole P) as one factor on keyframe 0."""
+    """Return the prior (a STATE record, its whole P) as one factor on keyframe 0, normal in the invariant error.
+
+    So a velocity that is known in B stays known, whatever the heading turns out to be.
+    """
+    A = to_invariant(prior[0]["R_WB"].copy(), prior[0]["v_WB_W"].copy())
+    model = gtsam.noiseModel.Gaussian.Covariance(A @ prior[0]["P"] @ A.T)
 
     def linearise(pose: Array, v_WB_W: Array, bias: Array) -> Linearised:
         return _linearise_prior(prior, pose, v_WB_W, bias, rig[0]["R_BI"])
 
-    return custom_factor(gtsam.noiseModel.Gaussian.Covariance(prior[0]["P"]), [X(0), V(0), B(0)], linearise)
+    return custom_factor(model, [X(0), V(0), B(0)], linearise)
 
 
 def linearise_alike(state: NavState, R_BI: Array) -> tuple[Callable[[int], None], Callable[[int], None]]:
@@ -441,6 +444,8 @@ def as_state(pose: gtsam.Pose3, v_WB_W: Array, bias: gtsam.imuBias.ConstantBias,
 def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array | None = None) -> Array:
     """Return GTSAM's joint covariance of (pose, velocity, bias) as that of our error state, (15, 15), at R_WB.
 
+    Rotation and velocity are taken for normal in the invariant error, whose second order is added (`spread_velocity`).
+
     Args:
         joint: (15, 15) in GTSAM's tangents.
         R_WB: the estimate's.
@@ -454,7 +459,9 @@ def as_covariance(joint: Array, R_WB: Array, R_BI: Array, R_WB_linearised: Array
     G[THETA, THETA], G[VELOCITY, VELOCITY] = right_jacobian(log(product(R_at.T, R_WB))), np.eye(3)
     G[POSITION, POSITION] = R_at
     G[ACCEL_BIAS, ACCEL_BIAS] = G[GYRO_BIAS, GYRO_BIAS] = R_BI.T
-    return G @ joint @ G.T
+    P = G @ joint @ G.T
+    spread_velocity(P, R_WB)
+    return P
 
 
 @contextmanager

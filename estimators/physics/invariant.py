@@ -224,3 +224,28 @@ def error_after_invariant(state: NDArray[Any], xi: Array, K: Array) -> None:
         for j in range(3):
             K[VELOCITY_0 + i, PHI_0 + j] += Q[i, j]
             K[VELOCITY_0 + i, NU_0 + j] = J_l[i, j]
+
+
+@compiled
+def invariant_after_error(state: NDArray[Any], xi: Array, H: Array) -> None:
+    """Fill H (15, 15), the inverse of `error_after_invariant`: the derivative of xi by our error at the state.
+
+    dphi = J_l⁻¹ R theta and dnu = J_l⁻¹ (e_v − Q dphi + [v]× R theta).
+    """
+    s, matrices, minus = state[0], np.empty((8, 3, 3)), np.empty(3)
+    J, Q, by_theta, S, A = matrices[0], matrices[1], matrices[2], matrices[3], matrices[4]
+    for i in range(3):
+        minus[i] = -xi[PHI_0 + i]
+    inverse_right_jacobian_into(minus, J)  # J_l⁻¹(phi)
+    mixed_jacobian_into(xi[PHI], xi[NU], Q, matrices[5:8])
+    product_into(J, s.R_WB[:], by_theta)
+    identity(H)
+    set_block(H, PHI_0, THETA_0, 1.0, by_theta)
+    set_block(H, NU_0, VELOCITY_0, 1.0, J)
+    skew_into(s.v_WB_W[:], S)
+    product_into(S, s.R_WB[:], A)
+    product_into(Q, by_theta, S)
+    for i in range(3):
+        for j in range(3):
+            A[i, j] -= S[i, j]
+    set_product(H, NU_0, THETA_0, 1.0, J, A)

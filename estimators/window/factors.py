@@ -28,6 +28,9 @@ from .chain import copy_into
 AT_KEYFRAME, CARRIED, LOOSE, TIGHT = range(4)
 """What a factor is: a reading that was true at its keyframe, one that the IMU carries there, and displacements."""
 
+AT_PREDICTION = 1e-3
+"""rad and m/s: carried to a state this near the prediction, the noise of an IMU block changes by a thousandth."""
+
 FACTOR = np.dtype(
     [
         ("next", "i8"),  # of the same keyframe; -1 for none
@@ -179,37 +182,50 @@ def linearise_tie(
     rotation φ and velocity ν, an error (θ, e_v) that starts at x⁻ is carried there by the adjoint of SE_2(3), and noise
     by its right Jacobian, whose lower block is that of the left at −φ, −ν.
     """
-    end, matrices, r, gap, minus = np.empty(1, STATE), np.empty((8, 3, 3)), np.empty(DIM), np.empty(3), np.empty((2, 3))
-    turn, S, J, mixed = matrices[0], matrices[1], matrices[2], matrices[3]
-    M, scratch = np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    end, matrices, r, vectors = np.empty(1, STATE), np.empty((3, 3, 3)), np.empty(DIM), np.empty((3, 3))
+    turn, S, A = matrices[0], matrices[1], matrices[2]
+    gap, back, lacking = vectors[0], vectors[1], vectors[2]
     predict(block, x_i, gravity, F, end)
     process_noise(block, x_i[0].R_WB[:], Q)
     tie_residual(end, x_j, r)
-    s, x = x_j[0], end[0]
+    s, size = x_j[0], 0.0
     for i in range(3):
-        gap[i] = x.v_WB_W[i] - s.v_WB_W[i]
-        minus[0, i], minus[1, i] = -r[THETA_0 + i], -r[VELOCITY_0 + i]
+        gap[i] = end[0].v_WB_W[i] - s.v_WB_W[i]
+        back[i], lacking[i] = -r[THETA_0 + i], -r[VELOCITY_0 + i]
+        size += back[i] ** 2 + lacking[i] ** 2
     for i in range(DIM):
         c[i] = -r[i]
-    transform_into(s.R_WB[:], minus[1], c[VELOCITY])
-    exp_into(minus[0], turn)
+    transform_into(s.R_WB[:], lacking, c[VELOCITY])
+    exp_into(back, turn)
     turn_rows(F, turn)
     skew_into(gap, S)
-    product_into(S, s.R_WB[:], turn)
+    product_into(S, s.R_WB[:], A)
     for i in range(3):
         for k in range(3):
             for j in range(DIM):
-                F[VELOCITY_0 + i, j] += turn[i, k] * F[THETA_0 + k, j]
+                F[VELOCITY_0 + i, j] += A[i, k] * F[THETA_0 + k, j]
+    if size > AT_PREDICTION**2:
+        carry_noise(end, s.R_WB[:], r, Q)
+
+
+@compiled
+def carry_noise(end: NDArray[Any], R_j: Array, r: Array, Q: Array) -> None:
+    """Carry the noise Q (15, 15) of a block from its prediction, a STATE record, to R_j, where its residual is r."""
+    matrices, M, back = np.empty((7, 3, 3)), np.empty((DIM, DIM)), np.empty((2, 3))
+    J, mixed, R_JW, turned = matrices[0], matrices[1], matrices[2], matrices[3]
+    for i in range(3):
+        back[0, i], back[1, i] = -r[THETA_0 + i], -r[VELOCITY_0 + i]
     right_jacobian_into(r[THETA], J)
-    mixed_jacobian_into(minus[0], minus[1], mixed, matrices[5:8])
-    identity(M)
-    set_block(M, THETA_0, THETA_0, 1.0, J)
-    set_product(M, VELOCITY_0, THETA_0, 1.0, s.R_WB[:], mixed)
-    product_into(s.R_WB[:], J, S)
+    mixed_jacobian_into(back[0], back[1], mixed, matrices[4:7])
     for i in range(3):
         for j in range(3):
-            M[VELOCITY_0 + i, VELOCITY_0 + j] = S[i, 0] * x.R_WB[j, 0] + S[i, 1] * x.R_WB[j, 1] + S[i, 2] * x.R_WB[j, 2]
-    congruent(M, Q, scratch)
+            R_JW[i, j] = end[0].R_WB[j, i]
+    product_into(J, R_JW, turned)
+    identity(M)
+    set_block(M, THETA_0, THETA_0, 1.0, J)
+    set_product(M, VELOCITY_0, THETA_0, 1.0, R_j, mixed)
+    set_product(M, VELOCITY_0, VELOCITY_0, 1.0, R_j, turned)
+    congruent(M, Q, np.empty((DIM, DIM)))
 
 
 @compiled

@@ -11,6 +11,7 @@ from fathom.estimators.physics.invariant import (
     error_after_invariant,
     from_invariant,
     inject_moved,
+    invariant_after_error,
     local_invariant,
     move,
     retract_invariant,
@@ -68,6 +69,9 @@ def test_its_derivatives_are_finite_differences(size: float) -> None:
     error_after_invariant(record(y), xi, K)
     numeric = np.stack([(y.local(after(xi + e)) - y.local(after(xi - e))) / 2e-6 for e in 1e-6 * np.eye(DIM)], axis=1)
     assert np.allclose(K, numeric, atol=1e-7 * max(1.0, np.abs(K).max()))
+    H = np.empty((DIM, DIM))
+    invariant_after_error(record(y), xi, H)
+    assert np.allclose(H @ K, np.eye(DIM), atol=1e-12)
     A, B = to_invariant(x.R_WB, x.v_WB_W), from_invariant(x.R_WB, x.v_WB_W)
     assert np.allclose(A @ B, np.eye(DIM), atol=1e-13)
     P, Q = some_covariance(rng, 0.1), np.empty((DIM, DIM))
