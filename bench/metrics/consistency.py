@@ -190,7 +190,7 @@ def autocorrelation(white: Array) -> float | None:
 
     Of innovations with their covariance divided out. Those of a consistent filter are white: 0, with a σ of one over
     the root of all their degrees of freedom. The mean is not subtracted, so a bias shows as well. Components that were
-    not measured are 0. See docs/conventions.md (68).
+    not measured are 0. See docs/conventions.md (74).
     """
     square = float((white * white).sum())
     return float((white[1:] * white[:-1]).sum()) / square if len(white) > 1 and square > 0.0 else None

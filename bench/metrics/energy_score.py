@@ -15,7 +15,7 @@ ROWS = 4096
 
 
 def energy_score(error: Array, cov: Array) -> Array:
-    """Return E|X − y| − ½ E|X − X'| of truths y under estimates X, X' ~ N(mean, cov); docs/conventions.md (65).
+    """Return E|X − y| − ½ E|X − X'| of truths y under estimates X, X' ~ N(mean, cov); docs/conventions.md (71).
 
     It is proper: an estimator has its best mean score by stating the law of its error. With cov = 0 it is |error|.
 
@@ -39,7 +39,7 @@ def energy_score(error: Array, cov: Array) -> Array:
 
 
 def mean_length(mean: Array, variances: Array) -> Array:
-    """Return E|x| of x ~ N(mean, diag(variances)), both (n, d), as (n,); docs/conventions.md (66).
+    """Return E|x| of x ~ N(mean, diag(variances)), both (n, d), as (n,); docs/conventions.md (72).
 
     E|x| = π^−½ ∫ (1 − E exp(−u² |x|²)) / u² du over u > 0, by Gauss's rule in (1 + w)/(1 − w) = u √E|x|².
     """

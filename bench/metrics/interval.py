@@ -46,7 +46,7 @@ def interval(
 ) -> tuple[float, float] | None:
     """Return the interval of a statistic over seeds; None with fewer than FEWEST_SEEDS. HOLDS says what it covers.
 
-    Equation: docs/conventions.md (63).
+    Equation: docs/conventions.md (69).
 
     Args:
         data: (n,) arrays that belong together, seed by seed: values, weights, values, weights, ...

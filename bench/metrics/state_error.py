@@ -128,7 +128,7 @@ def coverage(
 def share_inside(nees: Array, dof: int, probability: float) -> float:
     """Return the share of errors inside the ellipsoid of this probability, by their NEES (n,).
 
-    Of a consistent Gaussian estimate it is the probability, on average; docs/conventions.md (64). NaNs are left out.
+    Of a consistent Gaussian estimate it is the probability, on average; docs/conventions.md (70). NaNs are left out.
     """
     known = nees[~np.isnan(nees)]
     return float((known <= 2.0 * gammaincinv(0.5 * dof, probability)).mean())

@@ -97,7 +97,7 @@ class Sea:
         """Return the standard deviation to be told for what waves do to a pressure sensor at heights z_m, (n,) m.
 
         White noise of this sigma, in readings every period_s, has a mean over any window that errs by no less than the
-        mean of rise_m: docs/conventions.md (69). For a single reading it is no less than the rms of rise_m. Readings
+        mean of rise_m: docs/conventions.md (75). For a single reading it is no less than the rms of rise_m. Readings
         must come three times in a wave's period or more often, or waves look slower than they are.
         """
         k = self.frequency_rad_s**2 / self.gravity

@@ -1,1 +1,1 @@
-"""Kalman filters: eskf, eskf-filterpy, iekf, ukf, and the rts smoother on top of eskf."""
+"""Kalman filters: eskf, eskf-filterpy, iekf, ukf, and the rts smoother on top of one of them."""

@@ -15,29 +15,32 @@ from pydantic.dataclasses import dataclass
 from scipy.linalg import LinAlgWarning
 
 from ...datasets.rig import Rig
-from ...datasets.state import DIM, Array, Belief
+from ...datasets.state import DIM, THETA, Array, Belief
 from ..physics.imu import integrate, predict, process_noise
 from ..physics.measurements import measure
-from ..physics.state import inject
-from .filter_pass import FilterOptions, FilterPass, Kalman
+from ..physics.so3 import right_jacobian
+from ..physics.state import inject, retract
+from .eskf import ErrorStateOptions, inject_first_estimate
+from .filter_pass import FilterPass, Kalman
 
 
 @dataclass(frozen=True)
-class FilterpyKalmanFilter(FilterOptions):
+class FilterpyKalmanFilter(ErrorStateOptions):
     """Error-state extended Kalman filter over (theta, p, v, b_a, b_g), by filterpy; agrees with `eskf`."""
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""
-        return FilterPass(self, prior, rig, FilterpyKalman())
+        return FilterPass(self, prior, rig, FilterpyKalman(self.iterations, self.first_estimate))
 
 
 class FilterpyKalman(Kalman):
     """See `Kalman`."""
 
-    def __init__(self) -> None:
+    def __init__(self, iterations: int, first_estimate: bool) -> None:
         from filterpy.kalman import ExtendedKalmanFilter  # slow to import, and no other command needs it
 
-        self._filter = ExtendedKalmanFilter
+        self._filter, self._iterations = ExtendedKalmanFilter, iterations
+        self._inject = inject_first_estimate if first_estimate else inject
 
     def predict(
         self, state: NDArray[Any], rig: NDArray[Any], before: NDArray[Any], imu: NDArray[Any], block: NDArray[Any]
@@ -52,25 +55,36 @@ class FilterpyKalman(Kalman):
 
     def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
         """See `Kalman.correct`."""
-        ekf = self._about(state)
-        r, H, C = stack(state, rig, readings)
-        if len(r):
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", LinAlgWarning)  # S is checked below
-                    ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
-                np.linalg.cholesky(ekf.S)
-            except (np.linalg.LinAlgError, ValueError):  # scipy raises it if something is not finite
+        ekf, at, dx = self._about(state), state.copy(), np.zeros(DIM)
+        for _ in range(self._iterations):
+            r, H, C = stack(at, rig, readings)
+            H[:, THETA] = H[:, THETA] @ right_jacobian(dx[THETA])  # of the error at the prediction
+            ekf = self._about(state)
+            if len(r) and not _update(ekf, r - H @ dx, H, C):
                 return False
+            dx = ekf.x
+            retract(state, dx, at)
         state[0]["P"] = ekf.P
-        inject(state, ekf.x)
-        return bool(np.isfinite(ekf.x).all())
+        self._inject(state, dx)
+        return bool(np.isfinite(dx).all())
 
     def _about(self, state: NDArray[Any]) -> Any:
         """Return filterpy's filter of the state's error, which is zero."""
         ekf = self._filter(dim_x=DIM, dim_z=1)
         ekf.x, ekf.P = np.zeros(DIM), state[0]["P"].copy()
         return ekf
+
+
+def _update(ekf: Any, r: Array, H: Array, C: Array) -> bool:
+    """Correct filterpy's filter by rows; False where their innovation has no usable covariance."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LinAlgWarning)  # S is checked below
+            ekf.update(np.zeros(len(r)), HJacobian=lambda error: H, Hx=lambda error: r, R=C)  # r is h ⊖ z
+        np.linalg.cholesky(ekf.S)
+    except (np.linalg.LinAlgError, ValueError):  # scipy raises it if something is not finite
+        return False
+    return True
 
 
 def stack(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> tuple[Array, Array, Array]:

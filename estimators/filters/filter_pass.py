@@ -55,7 +55,8 @@ class FilterOptions:
 class Kalman(ABC):
     """A filter: predicts a STATE record (of length 1) over a motion, and corrects it by readings, in place.
 
-    Its P may be of an error of its own, which `error_covariance` converts to ours. Either step may raise Diverged.
+    Its P is of our error, at least to first order: what it hands out is `error_covariance`. Either step may raise
+    Diverged.
 
     Attributes:
         stopped_by: the kind of reading that it cannot take while the heading is unknown since the start; by default
@@ -77,7 +78,7 @@ class Kalman(ABC):
         """Correct by readings of the present time; False if S or the state is unusable."""
 
     def error_covariance(self, state: NDArray[Any]) -> Array:
-        """Return the covariance (15, 15) of our error state: P itself, unless the filter's error is another."""
+        """Return the covariance (15, 15) of our error state: P itself, unless the filter knows it to more orders."""
         return state["P"][0]
 
 
@@ -97,7 +98,7 @@ class FilterPass:
     with the reading in its place. A reading that is later than that is counted and dropped.
 
     Args:
-        config, prior, rig: as for `Estimator.begin`; the prior's P is already of the filter's own error.
+        config, prior, rig: as for `Estimator.begin`.
         kalman: the filter.
         on_epoch: called after each epoch with the epoch, the state at its end, and the block that led there; called
             again for each replayed epoch.

@@ -1,19 +1,21 @@
-"""Rauch–Tung–Striebel: the error-state Kalman filter forwards, then backwards; docs/conventions.md (44).
+"""Rauch–Tung–Striebel: a Kalman filter forwards, then backwards; docs/conventions.md (44).
 
 Source: Rauch, Tung & Striebel 1965, doi:10.2514/3.3166, on the manifold. With x_k the filtered state of epoch k, P_k
 its covariance, x⁻ = f(x_k) and P⁻ = F P_k Fᵀ + Q the prediction of epoch k + 1, and S for what is smoothed:
 
-    G = P_k Fᵀ (P⁻)⁻¹        d = G Log(x⁻, x^S_k+1)        x^S_k = x_k ⊕ d
+    G = P_k Fᵀ (P⁻)⁻¹        d = G (x^S_k+1 ⊖ x⁻)        x^S_k = x_k ⊕ d
     P^S_k = P_k + G (P^S_k+1 − P⁻) Gᵀ
 
-Here P⁻ and P_k are of errors at x⁻ and x_k (the filter has already applied its reset to P_k); P^S_k+1 is of
-errors at x^S_k+1, so it is carried to x⁻ by the inverse right Jacobian of the step between them, and P^S_k from x_k to
-x^S_k by the right Jacobian of d.
+Here P⁻ and P_k are of errors at x⁻ and x_k (the filter has already applied its reset to P_k); P^S_k+1 is of errors at
+x^S_k+1, so it is carried to x⁻, and P^S_k from x_k to x^S_k.
+
+⊕, ⊖ and the carrying are those of the filter. On `eskf` they are (7), (8) and (9), by right Jacobians; on `iekf` (39),
+its inverse, and (67). Its G is of our error, and so is d: linear in the invariant error, at x_k and at x⁻, by (41).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +29,14 @@ from ...datasets.trajectory import Trajectory
 from ..interface import Diverged
 from ..physics.elimination import divide_into
 from ..physics.imu import BLOCK, predict, process_noise, sandwich
+from ..physics.invariant import carry_over, inject_invariant, local_moved
 from ..physics.so3 import inverse_right_jacobian_into
 from ..physics.state import STATE, as_belief, as_record, inject, local, turn_covariance, with_rate_noise
 from ..stages import stage
-from .eskf import ErrorStateKalman
+from ..unknown_start import refuse_unknown_velocity
+from .eskf import ErrorStateKalman, ErrorStateKalmanFilter
 from .filter_pass import FilterOptions, FilterPass
+from .iekf import InvariantKalman, InvariantKalmanFilter
 
 TRIANGLE = DIM * (DIM + 1) // 2
 """Numbers in one half of a symmetric matrix."""
@@ -52,10 +57,24 @@ class Page:
 
 @dataclass(frozen=True)
 class RauchTungStriebelSmoother(FilterOptions):
-    """`eskf` forwards, then the backward pass at the end of the log; online its beliefs are those of `eskf`."""
+    """A filter forwards, then the backward pass at the end of the log; online its beliefs are those of the filter.
+
+    Attributes:
+        filter: which one, with its coordinates. `eskf` is a little cheaper, and claims too much where it starts with a
+            heading that it hardly knows.
+    """
+
+    filter: Literal["eskf", "iekf"] = "iekf"
+
+    @property
+    def honest_yaw_rad(self) -> float:
+        """As of its filter."""
+        return (InvariantKalmanFilter if self.filter == "iekf" else ErrorStateKalmanFilter).honest_yaw_rad
 
     def begin(self, prior: Belief, rig: Rig) -> RauchTungStriebelPass:
         """See `Estimator.begin`."""
+        if self.filter == "iekf":
+            refuse_unknown_velocity(prior)
         return RauchTungStriebelPass(self, prior, rig)
 
 
@@ -63,7 +82,9 @@ class RauchTungStriebelPass:
     """One pass of `RauchTungStriebelSmoother`."""
 
     def __init__(self, config: RauchTungStriebelSmoother, prior: Belief, rig: Rig) -> None:
-        self._forwards = FilterPass(config, prior, rig, ErrorStateKalman(), self._remember_epoch)
+        self._kalman = InvariantKalman() if config.filter == "iekf" else ErrorStateKalman()
+        self._is_invariant = config.filter == "iekf"
+        self._forwards = FilterPass(config, prior, rig, self._kalman, self._remember_epoch)
         self.counts = self._forwards.counts
         self._pages: list[Page] = []
         self._length = 0
@@ -91,9 +112,11 @@ class RauchTungStriebelPass:
             page = self._pages.pop()
             ticks = np.flatnonzero(page.tick[:filled])
             smoothed = np.zeros(len(ticks), STATE)
-            if not smooth(page.mean, page.P, page.block, filled, page.tick, later, block, rig, smoothed):
+            known = page.mean, page.P, page.block, filled, page.tick
+            if not smooth(*known, later, block, rig, self._is_invariant, smoothed):
                 raise Diverged("a predicted covariance is not positive definite")
             for k in range(len(ticks) - 1, -1, -1):
+                smoothed[k]["P"] = self._kalman.error_covariance(smoothed[k : k + 1])
                 belief = as_belief(int(page.t_ns[ticks[k]]), smoothed[k : k + 1])
                 beliefs.append(with_rate_noise(belief, rig))
             filled = PAGE
@@ -167,7 +190,7 @@ def recall(mean: Array, P: Array, row: int, state: NDArray[Any]) -> None:
 @compiled
 def smooth(
     mean: Array, P: Array, blocks: NDArray[Any], filled: int, tick: NDArray[np.bool_],
-    later: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], out: NDArray[Any],
+    later: NDArray[Any], block: NDArray[Any], rig: NDArray[Any], is_invariant: bool, out: NDArray[Any],
 ) -> bool:  # fmt: skip
     """Smooth the epochs of one page, from the last to the first; False if a prediction has a bad covariance.
 
@@ -176,6 +199,7 @@ def smooth(
         later: STATE record of length 1, the smoothed state after the page's last; replaced by that of its first.
         block: BLOCK record of length 1, the motion that leads to `later`; likewise.
         rig: RIG record of length 1.
+        is_invariant: the coordinates are those of `physics.invariant`; else of `physics.state`.
         out: STATE records, filled with the smoothed states of the ticks.
     """
     wanted = len(out)
@@ -183,7 +207,7 @@ def smooth(
     for row in range(filled - 1, -1, -1):
         now = ahead.copy()
         recall(mean, P, row, now)
-        if not smooth_one(now, later, block, rig[0].gravity, ahead):
+        if not smooth_one(now, later, block, rig[0].gravity, is_invariant, ahead):
             return False
         later[0] = now[0]
         block[0] = blocks[row]
@@ -195,7 +219,7 @@ def smooth(
 
 @compiled
 def smooth_one(
-    now: NDArray[Any], later: NDArray[Any], block: NDArray[Any], gravity: float, ahead: NDArray[Any]
+    now: NDArray[Any], later: NDArray[Any], block: NDArray[Any], gravity: float, is_invariant: bool, ahead: NDArray[Any]
 ) -> bool:
     """Smooth `now`, in place, given the smoothed state `later` and the block between; `ahead` is scratch."""
     F, Q, P_ahead = np.empty((DIM, DIM)), np.empty((DIM, DIM)), np.empty((DIM, DIM))
@@ -205,9 +229,13 @@ def smooth_one(
     process_noise(block, now[0].R_WB[:], Q)
     sandwich(F, P, Q, P_ahead)
 
-    local(ahead, later, d)
-    inverse_right_jacobian_into(d[THETA], J)
-    turn_covariance(gained, J)
+    if is_invariant:
+        local_moved(ahead, later, d)
+        carry_over(later, ahead, False, gained)
+    else:
+        local(ahead, later, d)
+        inverse_right_jacobian_into(d[THETA], J)
+        turn_covariance(gained, J)
     for i in range(DIM):
         for j in range(DIM):
             gained[i, j] -= P_ahead[i, j]
@@ -228,5 +256,8 @@ def smooth_one(
         for j in range(DIM):
             for k in range(DIM):
                 P[i, j] += left[i, k] * Gt[k, j]
-    inject(now, step)
+    if is_invariant:
+        inject_invariant(now, step)
+    else:
+        inject(now, step)
     return True

@@ -13,7 +13,8 @@ Bonnabel 2017, doi:10.1109/IROS.2017.8206066, for retracting sigma points.
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,7 @@ class UnscentedKalmanFilter(FilterOptions):
 
     alpha: Number = Field(default=0.3, ge=1e-3, le=1)
     beta: NotNegative = 2.0
+    honest_yaw_rad: ClassVar[float] = math.radians(3.0)  # NEES of attitude 3.4 at 5°, 10 at 10°, as of `eskf`
 
     def begin(self, prior: Belief, rig: Rig) -> FilterPass:
         """See `Estimator.begin`."""

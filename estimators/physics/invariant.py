@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import DIM, THETA, VELOCITY, Array
-from .blocks import identity, set_block, set_product
+from .blocks import clear, identity, set_block, set_product
+from .imu import sandwich
 from .so3 import (
+    between_into,
     cross_into,
     exp_into,
     inverse_right_jacobian_into,
@@ -155,7 +157,7 @@ def congruent(A: Array, P: Array, scratch: Array) -> None:
 
 @compiled
 def spread_velocity(P: Array, R_WB: Array) -> None:
-    """Add to P (15, 15), of our error, the second order in which an invariant error moves the velocity.
+    """Add to P (15, 15), of our error, the second order in which an invariant error moves the velocity: (66).
 
     With phi = R theta, v_true − v = e + ½ phi × e + …, where e = nu − v × phi is the first order. At a heading that is
     known to 25° a velocity that is known in B lies on an arc, and leaves its chord e by 10 % of itself; one that is
@@ -249,3 +251,49 @@ def invariant_after_error(state: NDArray[Any], xi: Array, H: Array) -> None:
         for j in range(3):
             A[i, j] -= S[i, j]
     set_product(H, NU_0, THETA_0, 1.0, J, A)
+
+
+@compiled
+def local_moved(state: NDArray[Any], other: NDArray[Any], error: Array) -> None:
+    """Fill our error (15,) by which `inject_invariant` moves the state to `other`."""
+    xi, turned = np.empty(DIM), np.empty(3)
+    local_invariant(state, other, xi)
+    for i in range(DIM):
+        error[i] = xi[i]
+    inverse_transform_into(state[0].R_WB[:], xi[PHI], error[THETA])
+    cross_into(state[0].v_WB_W[:], xi[PHI], turned)
+    for i in range(3):
+        error[VELOCITY_0 + i] -= turned[i]
+
+
+@compiled
+def inject_invariant(state: NDArray[Any], error: Array) -> None:
+    """`move` the state by our error (15,), and carry P, of our error, along: that of the invariant error stays."""
+    before = state.copy()
+    move(before, error, state)
+    carry_over(before, state, False, state[0].P[:])
+
+
+@compiled
+def carry_over(old: NDArray[Any], new: NDArray[Any], position: bool, P: Array) -> None:
+    """P ← T P Tᵀ, which takes P (15, 15) of our error at one state to another, with the invariant error kept.
+
+    T = `from_invariant` at the new state times `to_invariant` at the old: docs/conventions.md (67). With `position`,
+    position counts to the group as well, from the origin of W: (65).
+    """
+    o, n, T, none = old[0], new[0], np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    S, change, turn = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    identity(T)
+    between_into(n.R_WB[:], o.R_WB[:], turn)
+    set_block(T, THETA_0, THETA_0, 1.0, turn)
+    for i in range(3):
+        change[i] = o.v_WB_W[i] - n.v_WB_W[i]
+    skew_into(change, S)
+    set_product(T, VELOCITY_0, THETA_0, 1.0, S, o.R_WB[:])
+    if position:
+        for i in range(3):
+            change[i] = o.p_WB_W[i] - n.p_WB_W[i]
+        skew_into(change, S)
+        set_product(T, POSITION_0, THETA_0, 1.0, S, o.R_WB[:])
+    clear(none)
+    sandwich(T, P, none, P)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled
-from ...datasets.state import DIM
+from ...datasets.state import DIM, Array
 from .elimination import absorb
 from .imu import integrate, predict, process_noise, sandwich
 from .measurements import measure
@@ -43,13 +43,21 @@ def carry(block: NDArray[Any], state: NDArray[Any], gravity: float) -> None:
 @compiled
 def correct(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
     """Correct by all readings, linearised together at the predicted state; False where that is impossible."""
-    dx, r, H, C = np.zeros(DIM), np.empty(3), np.empty((3, DIM)), np.empty((3, 3))
+    dx = np.zeros(DIM)
+    if not find_correction(state, rig, readings, dx):
+        return False
+    inject(state, dx)
+    return True
+
+
+@compiled
+def find_correction(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any], dx: Array) -> bool:
+    """Add to dx (15,), which is zero, the correction by all readings; P becomes that of the error less dx, (35)."""
+    r, H, C, total = np.empty(3), np.empty((3, DIM)), np.empty((3, 3)), 0.0
     for m in range(len(readings)):
         n = measure(readings, m, state, rig, r, H, C)
         if not absorb(n, r, H, C, dx, state[0].P[:]):
             return False
-    inject(state, dx)
-    total = 0.0
     for i in range(DIM):
         total += dx[i]
     return math.isfinite(total)

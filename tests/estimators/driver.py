@@ -14,7 +14,7 @@ from fathom.estimators.alignment.initialise import initialise
 from scipy.spatial.transform import Rotation
 
 FILTERS = ["eskf", "eskf-filterpy", "iekf", "ukf", "rts"]
-"""By their online beliefs; rts gives eskf's until it finishes."""
+"""By their online beliefs; rts gives iekf's until it finishes."""
 
 BLOCKS = {
     "position": POSITION,

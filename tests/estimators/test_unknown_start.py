@@ -47,18 +47,20 @@ def still_unknown(log: Log) -> Log:
     return log.with_prior(replace(log.prior, P=P))
 
 
-WITH_DVL = ["eskf", "eskf-filterpy", "ukf", "rts", "fls", "fls-batch"]
+WITH_DVL = ["eskf", "eskf-filterpy", "ukf", "fls", "fls-batch"]
 
 
-@pytest.mark.parametrize("name", WITH_DVL)
-def test_a_velocity_in_the_body_is_refused_while_the_heading_is_unknown(log: Log, name: str) -> None:
+@pytest.mark.parametrize(("name", "options"), [(name, {}) for name in WITH_DVL] + [("rts", {"filter": "eskf"})])
+def test_a_velocity_in_the_body_is_refused_while_the_heading_is_unknown(
+    log: Log, name: str, options: dict[str, Any]
+) -> None:
     with pytest.raises(StartError, match=r"heading is unknown.*`prior`.*`from_s`"):
-        run_log(replace(lost(log), heading=None), create(name))
+        run_log(replace(lost(log), heading=None), create(name, **options))
 
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [("iekf", {}), ("isam2", {}), ("window", {}), ("batch", {"engine": "window"}), ("dead-reckoning", {})],
+    [("iekf", {}), ("rts", {}), ("isam2", {}), ("window", {}), ("batch", {"engine": "window"}), ("dead-reckoning", {})],
 )
 def test_estimators_that_hold_for_any_yaw_take_an_unknown_heading(log: Log, name: str, options: dict[str, Any]) -> None:
     assert run_log(replace(lost(log), heading=None), create(name, **options)).online is not None

@@ -60,6 +60,12 @@ def test_an_estimator_is_told_of_where_the_heading_at_the_start_is_known_less_we
     ]
     assert not noticed(log, COUNTS, plain)
     assert "25°" in noticed(lost, COUNTS, plain)[0]
+    options = {"rts on eskf": {"filter": "eskf"}}
+    told = {
+        name: bool(noticed(lost, COUNTS, create(name.split()[0], **options.get(name, {}))))
+        for name in ("eskf", "eskf-filterpy", "ukf", "rts on eskf", "iekf", "rts")
+    }
+    assert told == {"eskf": True, "eskf-filterpy": True, "ukf": True, "rts on eskf": True, "iekf": False, "rts": False}
 
 
 def test_what_a_run_counts_is_told_worst_first() -> None:

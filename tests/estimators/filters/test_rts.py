@@ -19,19 +19,22 @@ from linear import LINEAR, TOY_RIG, least_squares, linear_toy
 from logs import DELAYED, until
 from paths import random_state
 
+ON = pytest.mark.parametrize("on", ["eskf", "iekf"])
 
-def smoothed(prior: Belief, epochs: list[Epoch], rig: object) -> Trajectory:
-    run = create("rts").begin(prior, rig)
+
+def smoothed(prior: Belief, epochs: list[Epoch], rig: object, on: str) -> Trajectory:
+    run = create("rts", filter=on).begin(prior, rig)
     for epoch in epochs:
         run.step(epoch)
     return run.finish()
 
 
+@ON
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_where_all_is_linear_it_is_least_squares(seed: int) -> None:
+def test_where_all_is_linear_it_is_least_squares(seed: int, on: str) -> None:
     prior, epochs = linear_toy(seed)
     exact, _ = least_squares(prior, epochs, TOY_RIG, LINEAR, 2)
-    ours = smoothed(prior, epochs, TOY_RIG)
+    ours = smoothed(prior, epochs, TOY_RIG, on)
     assert ours.lookahead_s == np.inf
     for k, belief in enumerate(exact):
         sigma = np.sqrt(np.diag(belief.P))[LINEAR]
@@ -41,9 +44,10 @@ def test_where_all_is_linear_it_is_least_squares(seed: int) -> None:
 
 
 @pytest.mark.slow
+@ON
 @pytest.mark.parametrize(("noise_scale", "iterations", "apart", "P_apart"), [(1.0, 4, 0.3, 0.1), (0.01, 3, 1e-4, 1e-3)])
 def test_on_a_real_mission_only_nonlinearity_parts_it_from_least_squares(
-    noise_scale: float, iterations: int, apart: float, P_apart: float
+    noise_scale: float, iterations: int, apart: float, P_apart: float, on: str
 ) -> None:
     """All of the state, turning: what parts them, in sigmas, shrinks with the square of the errors.
 
@@ -55,7 +59,7 @@ def test_on_a_real_mission_only_nonlinearity_parts_it_from_least_squares(
     assert len(epochs) == 100
     exact, step = least_squares(log.prior, epochs, log.rig, np.arange(15), iterations)
     assert np.abs(step).max() < 1e-3  # it has converged
-    ours = smoothed(log.prior, epochs, log.rig)
+    ours = smoothed(log.prior, epochs, log.rig, on)
     for k, belief in enumerate(exact):
         sigma = np.sqrt(np.diag(belief.P))
         assert np.abs(belief.state.local(ours.state(k)) / sigma).max() < apart
@@ -102,14 +106,15 @@ def test_smoothed_states_are_more_accurate_than_the_filter(mission: str) -> None
     assert velocity < 0.7
 
 
+@ON
 @pytest.mark.parametrize("seed", range(3))
-def test_smoothing_over_an_interval_of_zero_changes_nothing(seed: int) -> None:
+def test_smoothing_over_an_interval_of_zero_changes_nothing(seed: int, on: str) -> None:
     """Without motion and noise, smoothed equals filtered, with a state a radian away and to the last digit of P."""
     rng = np.random.default_rng(seed)
     x, M = random_state(rng), rng.normal(size=(2, 15, 15))
     now = as_record(Belief(0, x, M[0] @ M[0].T))
     later = as_record(Belief(0, x.retract(0.6 * rng.normal(size=15)), 0.1 * M[1] @ M[1].T))
-    assert smooth_one(now, later, STANDSTILL, 9.81, np.zeros(1, STATE))
+    assert smooth_one(now, later, STANDSTILL, 9.81, on == "iekf", np.zeros(1, STATE))
     assert np.abs(as_belief(0, now).state.local(as_belief(0, later).state)).max() < 1e-8
     assert np.allclose(now["P"], later["P"], rtol=1e-6, atol=1e-6)
 
