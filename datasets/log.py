@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,6 +214,11 @@ class Log:
     max_wait_s: float | None = None
 
     def __post_init__(self) -> None:
+        make_read_only(self)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Be what a copy or another process gets, whose arrays numpy has made writable."""
+        self.__dict__.update(state)
         make_read_only(self)
 
     @property

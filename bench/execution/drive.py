@@ -166,6 +166,7 @@ def run_log(
     max_gap_s: float = 1.0,
     timeout_s: float | None = None,
     nis: bool = False,
+    ours: bool | None = None,
 ) -> Result:
     """Drive an estimator through a log, in the order of reception.
 
@@ -184,6 +185,8 @@ def run_log(
             both halves; the belief is not charged, but what it leaves computed may make a smoother's next step cheaper.
             The estimates stay the same, except for a graph smoother with late readings: asked for a belief, it adds
             their factors at once and not with its next keyframe.
+        ours: whether the estimator is this package's; None to tell by its type. A wrapper around one of ours says so:
+            read-only copies are another type, for which all of it would be compiled once more.
 
     Raises:
         DatasetError: no prior can be made for the log.
@@ -192,7 +195,7 @@ def run_log(
     assert log.prior is not None
     limit_ns = math.inf if timeout_s is None else perf_counter_ns() + timeout_s * 1e9
     smoothed, finish_ns, counts, collector = None, (0, 0), {}, None
-    ours = is_ours(estimator)
+    ours = is_ours(estimator) if ours is None else ours
     content = None if ours else content_sha256(log)
     with _collector_off(), nullcontext() if ours else process_kept():
         factors, ending = _factors(estimator, ours, log.start_ns)

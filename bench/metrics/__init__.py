@@ -4,7 +4,7 @@
 (RPE, sub-trajectories) and `state_error` (velocity, biases, NEES, coverage) compare them, with `pose_error` below.
 `consistency` averages NEES and NIS over seeds, `interval` is the interval over seeds; `floor` is the Cramér–Rao bound,
 `floor_ratio` the RMSE over it. `scoring` has the names of all scores and computes them for a run. Equations:
-docs/conventions.md (51) to (61), and (69).
+docs/conventions.md (51) to (61), and (69) to (74).
 """
 
 from .absolute_error import Ate, Drift, HorizontalError, Outage, ate, drift, horizontal_error, outage_drift

@@ -21,7 +21,7 @@ from ...datasets.rig import Rig
 from ...datasets.state import Belief, TimeArray
 from ...datasets.trajectory import Trajectory
 from ...estimators.interface import Estimator, Pass
-from ...estimators.registry import EstimatorError
+from ...estimators.registry import EstimatorError, is_ours
 from ...estimators.stages import STAGES, clock
 from ..execution.child import start
 from ..execution.drive import run_log, score_ticks, warm_up
@@ -136,7 +136,7 @@ def timed_run(log: Log, estimator: Estimator, stages: bool) -> Timed | Estimator
     if stages:
         clock.start()
     try:
-        result = run_log(log, watched if stages else estimator)
+        result = run_log(log, watched if stages else estimator, ours=is_ours(estimator))
     finally:
         clock.stop()
     if result.status != "done":

@@ -125,22 +125,30 @@ def test_the_folder_is_the_users_not_the_checkouts() -> None:
     assert not compiled_folder().is_relative_to(ROOT)
 
 
+@pytest.fixture(scope="module")
+def used(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a copy of the package, and a cache that a second process has used."""
+    folder = tmp_path_factory.mktemp("used")
+    copy_of_the_package(folder)
+    for _ in range(2):
+        run(folder, NUMBA_CACHE_DIR=str(folder / "cache"))
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "damage"),
     [("*.nbi", b""), ("*.nbi", b"short"), ("*.nbc", bytes(range(256)) * 8), ("sources/*", bytes(range(256)))],
 )
-def test_damaged_files_are_compiled_anew_and_mended(tmp_path: Path, kind: str, damage: bytes) -> None:
+def test_damaged_files_are_compiled_anew_and_mended(used: Path, tmp_path: Path, kind: str, damage: bytes) -> None:
     cache = tmp_path / "cache"
-    copy_of_the_package(tmp_path)
-    run(tmp_path, NUMBA_CACHE_DIR=str(cache))
-    run(tmp_path, NUMBA_CACHE_DIR=str(cache))
+    shutil.copytree(used / "cache", cache)
     damaged = list(cache.rglob(kind))
     assert damaged
     for path in damaged:
         path.write_bytes(damage)
-    assert run(tmp_path, NUMBA_CACHE_DIR=str(cache))[0] == 2.0
-    value, hits, _, said = run(tmp_path, NUMBA_CACHE_DIR=str(cache))
+    assert run(used, NUMBA_CACHE_DIR=str(cache))[0] == 2.0
+    value, hits, _, said = run(used, NUMBA_CACHE_DIR=str(cache))
     assert (value, hits, said) == (2.0, 1, "")
 
 

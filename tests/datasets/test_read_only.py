@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+import pickle
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
-from fathom.datasets import Scenario, simulate
+from fathom.datasets import Log, Scenario, simulate
 
 
 def arrays(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
@@ -20,8 +22,14 @@ def arrays(value: Any, path: str) -> Iterator[tuple[str, np.ndarray]]:
             yield from arrays(part, name)
 
 
-def test_every_array_of_a_log_is_read_only() -> None:
-    log = simulate(Scenario(duration_s=20.0), seed=1)
+def sent(log: Log) -> Log:
+    """The log as another process gets it."""
+    return pickle.loads(pickle.dumps(log))
+
+
+@pytest.mark.parametrize("made", [replace, deepcopy, sent])
+def test_every_array_of_a_log_is_read_only(made: Callable[[Log], Log]) -> None:
+    log = made(simulate(Scenario(duration_s=20.0), seed=1))
     found = dict(arrays(log, "log"))
     assert {"log.imu.f_I", "log.dvl.sigma", "log.rig.gps.R_BS", "log.truth.R_WB", "log.prior.P"} <= found.keys()
     assert {"log.prior.state.R_WB", "log.rig.imu.p_BS_B", "log.heading.received_ns"} <= found.keys()

@@ -231,7 +231,7 @@ def test_a_planted_slowdown_of_a_score_ends_the_command_with_1(tmp_path: Path, s
     packages.mkdir(parents=True)
     for name in ("bench", "datasets", "estimators"):
         (packages / name).symlink_to(folder / name)
-    command = [sys.executable, "-m", "fathom.bench.cli.app", "timing", "against", "HEAD", "--only", "ATE"]
+    command = [sys.executable, "-m", "fathom.bench.cli.app", "timing", "against", "HEAD", "--short", "--only", "ATE"]
     done = subprocess.run(
         command, env=os.environ | {"PYTHONPATH": str(packages.parent)}, capture_output=True, text=True, check=False
     )

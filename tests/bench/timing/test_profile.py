@@ -16,6 +16,7 @@ from fathom.bench.timing.profile import Profile, draw_profile, profile, profile_
 from fathom.bench.timing.scaling import Steps, by_lag, course, over_log
 from fathom.datasets import Log, Scenario, simulate
 from fathom.estimators import ESTIMATORS, create
+from fathom.estimators.physics.kalman import correct, propagate
 from fathom.estimators.registry import EstimatorError
 from fathom.estimators.stages import clock, stage
 from rich.console import Console
@@ -119,6 +120,17 @@ def timed(step_ns: list[int], first_part: list[int]) -> Timed:
     return Timed(t_ns, np.array(step_ns), none, sum(step_ns), 1, {}, parts, nothing, None)
 
 
+def test_timing_the_stages_of_ours_compiles_nothing_more(log: Log) -> None:
+    def compiled() -> int:
+        return sum(len(function.signatures) for function in (propagate, correct))
+
+    timed_run(log, create("eskf"), stages=False)
+    before = compiled()
+    assert before >= 2
+    timed_run(log, create("eskf"), stages=True)
+    assert compiled() == before
+
+
 def test_of_each_step_the_quickest_is_taken_with_its_own_parts() -> None:
     best = quickest([timed([10, 50, 30], [1, 2, 3]), timed([20, 40, 99], [4, 5, 6])])
     assert best.step_ns.tolist() == [10, 40, 30]
@@ -184,7 +196,7 @@ def test_the_window_costs_more_by_lag_and_a_filter_has_none(log: Log) -> None:
 
 @pytest.fixture(scope="module")
 def profiles(log: Log) -> list[Profile]:
-    return profile({name: create(name) for name in ESTIMATORS}, log, repeats=4)
+    return profile({name: create(name) for name in ESTIMATORS}, log, repeats=2)
 
 
 @pytest.mark.slow
