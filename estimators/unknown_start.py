@@ -2,12 +2,13 @@
 
 Median NEES of attitude per degree of freedom, of a few simulated starts each:
 
-- Heading unknown, with a DVL, the yaw off by its sigma, and a compass after 15 s: at 45° 92 for `eskf` and `rts`, 129
-  for `ukf`, thousands for sums of the DVL; at 104° also 75 for `fls`, but 8 for `iekf`, whose error is exact for any
-  yaw while the velocity in B is known, and 0.5 for `isam2` and `batch`, which relinearise everything. `window`, which
-  carries its prior in such an error too, has 1.3 with GPS and no compass.
+- Heading unknown, with a DVL, the yaw off by its sigma, a compass after 15 s: at 45° 92 for `eskf`, and `rts` on it,
+  129 for `ukf`, thousands for sums of the DVL; at 104° also 75 for `fls`, but 8 for `iekf`, whose error is exact for
+  any yaw while the velocity in B is known, and 0.5 for `isam2` and `batch`, which relinearise everything. `window`,
+  which carries its prior in such an error too, has 1.3 with GPS and no compass.
 - Heading unknown, with GPS and no DVL: 2 for `eskf`, `ukf`, `window`, `isam2` and `batch`, hundreds for the others.
-- Velocity unknown, of no axis: 1 for `eskf` and `ukf`, 5 for `isam2`, 15 to 65 for `iekf`, `fls` and `window`.
+- Velocity unknown, of no axis: 1 for `eskf` and `ukf`, 5 for `isam2`, 15 to 65 for `fls`, `window` and an `iekf` whose
+  group held the position; of `iekf` as it is, and `rts` on it, not measured.
 """
 
 from __future__ import annotations
