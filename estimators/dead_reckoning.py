@@ -83,7 +83,7 @@ class DeadReckoningPass:
             imu = imu.copy()
             imu["w_WI_I"] = rate_bias
         displacement = preintegrate_dvl(
-            imu, self._t_ns, held_ns, self._v_WB_B[None], np.zeros((1, 3)), rate_bias, self._records, False
+            imu, self._t_ns, held_ns, self._v_WB_B[None], np.zeros((1, 3)), rate_bias, self._records, False, np.zeros(3)
         )
         self._p_WB_W = self._p_WB_W + self._R_WB @ displacement["dp"][0]
         if self._config.attitude == "gyro":

@@ -46,10 +46,10 @@ class GraphSmoother(ABC):
             velocity. So does every reading of an interval in which one leaves an axis unmeasured (wheel speed): as the
             vehicle turns, the unknown axis of B spreads over all axes of the sum. `not_summed` counts the readings of
             such intervals, and of those that max_hold_s excludes.
-        dvl_between: within a preintegrated interval, "held" holds the velocity from one reading to the next; "straight"
-            interpolates linearly, up to the reading at the interval's end (which then has a small part in two factors).
-            The covariance of "held" contains the noise of the DVL and the gyro, not the error of holding: on a vehicle
-            that manoeuvres it is overconfident.
+        dvl_between: within a preintegrated interval, "straight" interpolates from one reading to the next, up to the
+            reading at the interval's end (which then has a part in two factors); "held" holds the velocity. What the
+            vehicle does between readings is in the covariance of both, found from the readings' own differences
+            (`VelocityWalk`); holding loses four times as much, in one direction for as long as a manoeuvre lasts.
         keyframe_period_s: None for a keyframe at every DVL reading (1 s with a preintegrated factor).
         keyframe_timeout_s: see above.
         max_hold_s: an interval with a longer silence of the DVL is not preintegrated; its readings enter by velocity.
@@ -67,7 +67,7 @@ class GraphSmoother(ABC):
     """
 
     dvl: Annotated[frozenset[DvlFactor], Field(min_length=1), AfterValidator(_once)] = frozenset({"velocity"})
-    dvl_between: Literal["held", "straight"] = "held"
+    dvl_between: Literal["straight", "held"] = "straight"
     keyframe_period_s: Positive | None = None
     keyframe_timeout_s: Positive = 0.5
     max_hold_s: Positive = 1.5

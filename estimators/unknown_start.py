@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from ..datasets.state import THETA, VELOCITY, Belief
+from .interface import Diverged
 
 MOST_YAW_RAD = np.radians(45.0)
 """Beyond it a yaw is as good as unknown; compasses have up to 15°, headings by GPS 5°."""
@@ -49,6 +50,23 @@ def refuse_unknown_heading(belief: Belief) -> None:
     """
     if not knows_heading(belief):
         raise StartError(f"the heading is unknown since the start, and this estimator cannot find it so: {INSTEAD}")
+
+
+def refuse_lost_heading(belief: Belief) -> None:
+    """Refuse to sum the DVL from a keyframe on whose heading has been lost since the start.
+
+    A sum ties two positions by the rotation of the first, and where that is at the marginal prior it is not linearised
+    anew. Off by a radian, it throws the next position by tens of metres, which turn with the heading and are taken for
+    knowledge of it: seconds later the estimate is gone. Relinearised, or by velocities one by one, it is not.
+
+    Raises:
+        Diverged: the heading is lost.
+    """
+    if not knows_heading(belief):
+        raise Diverged(
+            f"the heading is lost, its sigma is over {np.degrees(MOST_YAW_RAD):.0f}°, and a window cannot sum the DVL "
+            "along it: aid the heading, or use `dvl: [velocity]`"
+        )
 
 
 def refuse_unknown_velocity(prior: Belief) -> None:

@@ -197,7 +197,9 @@ def _displacements(folder: Path) -> Work:
     for k in range(0, len(samples) - 100, 100):
         start_ns, block = int(samples["t_ns"][k] - round(samples["dt_s"][k] * 1e9)), samples[k : k + 100]
         t_ns = start_ns + np.arange(5) * 200_000_000
-        blocks.append((block, start_ns, t_ns, np.ones((5, 3)), np.full((5, 3), 0.01), np.zeros(3), rig, False))
+        blocks.append(
+            (block, start_ns, t_ns, np.ones((5, 3)), np.full((5, 3), 0.01), np.zeros(3), rig, True, np.zeros(3))
+        )
 
     def do() -> None:
         for block in blocks:

@@ -23,12 +23,13 @@ from ...datasets.trajectory import Trajectory
 from ..between_keyframes import carry_on
 from ..interface import OUTLIERS, Diverged
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, SOLVE, SUMMED, Keyframes
-from ..physics.dvl_preintegration import preintegrate_dvl
+from ..physics.dvl_preintegration import VelocityWalk, preintegrate_dvl
 from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict, split
 from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import Loss, width
 from ..smoothers import GraphSmoother
 from ..stages import clock, stage
+from ..unknown_start import refuse_lost_heading
 from .gtsam_border import (
     carried_factor,
     displacement_factor,
@@ -77,6 +78,7 @@ class GraphPass:
         self._losses: list[Loss | None] = [config.robust.get(sensor) for sensor in SENSOR]
         self._start_ns = self._now_ns = prior.t_ns
         self._keyframes = Keyframes(config, self._rig["inflate"][0], prior.t_ns)
+        self._walk = VelocityWalk()
         self._outliers: Counter[str] = Counter()
         self._solver = solver
         self._graph = gtsam.NonlinearFactorGraph()
@@ -227,10 +229,18 @@ class GraphPass:
         """Add the preintegrated-DVL factor of the interval just closed, of DVL readings in the order of their times."""
         last, new = self._window[-2], self._window[-1]
         imu = over_world(last.imu, self._newest.R_WB, self._newest.b_g, self._rig)
+        if np.isfinite(self._config.window_s):
+            if self._belief is None:
+                self._belief = self._solver.belief(last.index, last.t_ns)
+            refuse_lost_heading(self._belief)
+        velocities = (
+            readings["t_ns"].copy(),
+            readings["z"][:, :3].copy(),
+            self._rig["inflate"][0, DVL] * readings["sigma"],
+        )
         displacement = preintegrate_dvl(
-            imu, last.t_ns, readings["t_ns"].copy(), readings["z"][:, :3].copy(),
-            self._rig["inflate"][0, DVL] * readings["sigma"], self._newest.b_g, self._rig,
-            self._config.dvl_between == "straight",
+            imu, last.t_ns, *velocities, self._newest.b_g, self._rig, self._config.dvl_between == "straight",
+            self._walk.take(*velocities),
         )  # fmt: skip
         if "preintegrated-tight" in self._config.dvl:
             factor = tight_displacement_factor(last.index, new.index, displacement, self._rig)

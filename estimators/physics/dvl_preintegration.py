@@ -2,8 +2,12 @@
 
     Δp̃_ij = Σ_k ΔR̃_ik v_B,k Δt_k                                                   [docs/conventions.md (5)]
 
-in the axes of B at keyframe i. The rotation runs at IMU rate; the DVL's velocity is held from one reading to the next
-(or runs straight from one to the next), and over what is left, so that the sum ends exactly on keyframe j.
+in the axes of B at keyframe i. The rotation runs at IMU rate; the DVL's velocity runs straight from one reading to the
+next (or is held), and is held over what is left, so that the sum ends exactly on keyframe j.
+
+What the velocity does between readings is taken for a random walk in B, of density S. Held over a time T it is then off
+by a displacement of variance S T³/3; run straight between two readings, by S T³/12, that of a Brownian bridge. S is
+found from the readings themselves (`VelocityWalk`).
 
 A rotation error φ (B_i axes) that the gyro makes at time s turns all that comes later, and displaces by −[u]× φ with
 u = Δp̃(T) − Δp̃(s). So the errors of Δp̃ and of ΔR̃ go together, and the IMU factor beside knows of the latter:
@@ -22,6 +26,7 @@ u = Δp̃(T) − Δp̃(s). So the errors of Δp̃ and of ΔR̃ go together, and 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,6 +38,12 @@ from .blocks import clear, identity
 from .imu import HELD_RATE, turn_by
 from .so3 import product_into, skew_into, transform_into
 from .state import POSITION_0, THETA_0
+
+MANOEUVRE_S = 10.0
+"""How long a vehicle is taken to manoeuvre alike, s: fifty readings of a usual DVL, which find S to a fifth."""
+
+UNKNOWN_WALK = 0.1
+"""m²/s³: S before a second reading has come; a vehicle that gets under way gains 0.3 m/s in a second."""
 
 DISPLACEMENT = np.dtype(
     [
@@ -56,6 +67,7 @@ def preintegrate_dvl(
     b_g: Array,
     rig: NDArray[Any],
     straight: bool,
+    walk: Array,
 ) -> NDArray[Any]:
     """Sum DVL velocities over a block of IMU samples.
 
@@ -67,7 +79,9 @@ def preintegrate_dvl(
         sigma: (n, 3) m/s, independent from reading to reading.
         b_g: (3,) rad/s, gyro bias, in the IMU's axes.
         rig: RIG record of length 1.
-        straight: between readings the velocity runs straight from one to the next; otherwise it is held.
+        straight: between readings the velocity runs straight from one to the next; otherwise it is held. A reading
+            at keyframe i or j is then in two sums, and its variance counts twice in each: the sum of many is right.
+        walk: (3,) m²/s³, S of the velocity between readings, by axis of B.
 
     Returns:
         A DISPLACEMENT record of length 1. The noise of reading k displaces by Σ ΔR Δt over the time that it is held;
@@ -78,6 +92,7 @@ def preintegrate_dvl(
     capacity = len(imu) + n
     position, turn, q = np.empty((capacity, 3)), np.empty((capacity, 3, 3)), np.empty(capacity)  # piece by piece
     weight = np.zeros((n, 3, 3))  # Σ ΔR Δt by reading
+    over, over_s = np.zeros((n + 1, 3, 3)), np.zeros(n + 1)  # Σ ΔR Δt and Σ Δt after each reading; first, before all
     vectors, matrices = np.zeros((3, 3)), np.empty((2, 3, 3))
     w_I, w, dp = vectors[0], vectors[1], vectors[2]
     R, R_mid = matrices[0], matrices[1]
@@ -94,6 +109,8 @@ def preintegrate_dvl(
             until_ns = _end_of_piece(now_ns, sample.t_ns, t_ns, k)
             dt = (until_ns - now_ns) * 1e-9
             share, ahead = 0.0, k  # of the next reading
+            between = k + 1 if now_ns >= t_ns[k] else 0
+            over_s[between] += dt
             if straight and k + 1 < n and now_ns >= t_ns[k]:
                 share, ahead = (0.5 * (now_ns + until_ns) - t_ns[k]) / (t_ns[k + 1] - t_ns[k]), k + 1
             for i in range(3):
@@ -105,6 +122,7 @@ def preintegrate_dvl(
                 for j in range(3):
                     R_dt = dt * R_mid[i, j]
                     turn[piece, i, j] = R_dt
+                    over[between, i, j] += R_dt
                     weight[k, i, j] += (1.0 - share) * R_dt
                     weight[ahead, i, j] += share * R_dt
                     step += R_dt * ((1.0 - share) * v_WB_B[k, j] + share * v_WB_B[ahead, j])
@@ -121,8 +139,25 @@ def preintegrate_dvl(
         d.dp[i], d.b_g[i] = dp[i], b_g[i]
         for j in range(3):
             d.dR[i, j] = R[i, j]
-    _spread(turn, position, q, piece, weight, sigma, R_BI, out)
+    _spread(turn, position, q, piece, R_BI, out)
+    for k in range(n):
+        shared = straight and (t_ns[k] <= start_ns or t_ns[k] >= now_ns)
+        _add_noise(weight[k], sigma[k] ** 2, 2.0 if shared else 1.0, d.N[:])
+    for k in range(n + 1):
+        lost = 1.0 / 3.0
+        if straight and 0 < k < n:
+            lost -= over_s[k] / (4e-9 * (t_ns[k] - t_ns[k - 1]))
+        _add_noise(over[k], walk, lost * over_s[k], d.N[:])
     return out
+
+
+@inner
+def _add_noise(W: Array, variance: Array, scale: float, N: Array) -> None:
+    """Add scale W diag(variance) Wᵀ to the covariance of the displacement in N (6, 6)."""
+    for i in range(3):
+        for j in range(3):
+            for m in range(3):
+                N[POSITION_0 + i, POSITION_0 + j] += scale * W[i, m] * variance[m] * W[j, m]
 
 
 @inner
@@ -139,10 +174,8 @@ def _end_of_piece(now_ns: int, until_ns: int, t_ns: TimeArray, k: int) -> int:
 
 
 @inner
-def _spread(
-    turn: Array, position: Array, q: Array, pieces: int, weight: Array, sigma: Array, R_BI: Array, out: NDArray[Any]
-) -> None:
-    """Fill the bias Jacobians and the covariance N of a displacement whose dR and dp are there.
+def _spread(turn: Array, position: Array, q: Array, pieces: int, R_BI: Array, out: NDArray[Any]) -> None:
+    """Fill the bias Jacobians, and what gyro noise does to N, of a displacement whose dR and dp are there.
 
     A rotation impulse φ (B_i axes) at time s turns all that comes later: it adds −[u]× φ to Δp, u = Δp(T) − Δp(s). So
     gyro noise, isotropic and of variance q, has cov(Δp) = Σ q (u·u I − u uᵀ) and cov(φ, Δp) = Σ q [u]×.
@@ -152,8 +185,6 @@ def _spread(
         position: (pieces, 3) Δp in its middle.
         q: (pieces,) variance of its gyro noise, rad².
         pieces: how many there are.
-        weight: (n, 3, 3) Σ ΔR Δt by DVL reading.
-        sigma: (n, 3) of the readings.
         R_BI: mounting of the IMU.
         out: DISPLACEMENT record of length 1.
     """
@@ -161,11 +192,6 @@ def _spread(
     N, u, qu = d.N[:], vectors[0], vectors[1]
     turned, u_turned, N_pp, S = matrices[0], matrices[1], matrices[2], matrices[3]  # Σ dt ΔR and Σ dt [u]× ΔR
     q_sum = 0.0
-    for k in range(len(weight)):
-        for i in range(3):
-            for j in range(3):
-                for m in range(3):
-                    N_pp[i, j] += weight[k, i, m] * sigma[k, m] ** 2 * weight[k, j, m]
     for m in range(pieces):
         uu = 0.0
         for i in range(3):
@@ -195,6 +221,39 @@ def _spread(
         for j in range(3):
             N[THETA_0 + i, POSITION_0 + j], N[POSITION_0 + j, THETA_0 + i] = S[i, j], S[i, j]
             N[POSITION_0 + i, POSITION_0 + j] = N_pp[i, j]
+
+
+class VelocityWalk:
+    """The density S of the velocity's walk between readings, found from the differences of those that have come.
+
+        S = Σ (Δv² − σ₁² − σ₂²) / Σ Δt,  by axis of B, not below 0                       [docs/conventions.md (18)]
+
+    It is the larger of two: that of the interval itself, for a manoeuvre that has just begun, and one that forgets with
+    MANOEUVRE_S, for an interval of few readings. Both know the readings up to the interval's end and no later one.
+    """
+
+    def __init__(self) -> None:
+        self._squares, self._time_s = np.zeros(3), 0.0
+        self._last: tuple[int, Array, Array] | None = None
+
+    def take(self, t_ns: TimeArray, v_WB_B: Array, sigma: Array) -> Array:
+        """Return S (3,) m²/s³ for the interval of these readings; they are those of `preintegrate_dvl`."""
+        own, own_s = np.zeros(3), 0.0
+        for at_ns, v, variance in zip(t_ns.tolist(), v_WB_B, sigma**2, strict=True):
+            if self._last is not None and at_ns > self._last[0]:
+                then_ns, v_then, variance_then = self._last
+                dt = (at_ns - then_ns) * 1e-9
+                square = (v - v_then) ** 2 - variance - variance_then
+                own, own_s = own + square, own_s + dt
+                kept = math.exp(-dt / MANOEUVRE_S)
+                self._squares, self._time_s = kept * self._squares + square, kept * self._time_s + dt
+            if self._last is None or at_ns > self._last[0]:
+                self._last = at_ns, v, variance
+        walk = np.zeros(3) if self._time_s > 0.0 else np.full(3, UNKNOWN_WALK)
+        for squares, time_s in ((own, own_s), (self._squares, self._time_s)):
+            if time_s > 0.0:
+                walk = np.maximum(walk, squares / time_s)
+        return walk
 
 
 @compiled

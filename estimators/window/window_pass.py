@@ -20,13 +20,14 @@ from ...datasets.trajectory import Trajectory
 from ..between_keyframes import carry_on
 from ..interface import OUTLIERS, Diverged
 from ..keyframes import SUMMED, Keyframes
-from ..physics.dvl_preintegration import DISPLACEMENT, given_rotation, preintegrate_dvl
+from ..physics.dvl_preintegration import DISPLACEMENT, VelocityWalk, given_rotation, preintegrate_dvl
 from ..physics.imu import BLOCK, compile_rig, first_sample, over_world
 from ..physics.invariant import inject_moved, move
 from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import LOSSES, width
 from ..smoothers import GraphSmoother
 from ..stages import stage
+from ..unknown_start import refuse_lost_heading
 from . import steps
 from .chain import NODE, smooth_covariances
 from .factors import FACTOR, LOOSE, TIGHT
@@ -66,6 +67,7 @@ class WindowPass:
         self._lost = self._begun = self._swept = False
         self._rig = compile_rig(rig, config.factors, config.inflate, config.earth_rotation)
         self._keyframes = Keyframes(config, self._rig["inflate"][0], prior.t_ns)
+        self._walk = VelocityWalk()
         self._now_ns = self._covariance_due_ns = prior.t_ns
         self._ticks: deque[int] = deque()
         self._smoothed: list[tuple[int, NDArray[Any]]] = []
@@ -176,10 +178,17 @@ class WindowPass:
         move(x, self._nodes[a]["d"], x)
         begin, end = (int(self._nodes["imu_from"][j & mask] - self._w["imu_gone"][0]) for j in (k, k + 1))
         imu = over_world(self._imu[begin:end], x[0]["R_WB"], x[0]["b_g"], self._rig)
+        if np.isfinite(self._config.window_s):
+            x["P"] = self._nodes[a]["P"]
+            refuse_lost_heading(as_belief(int(self._nodes[a]["t_ns"]), x))
+        velocities = (
+            readings["t_ns"].copy(),
+            readings["z"][:, :3].copy(),
+            self._rig["inflate"][0, DVL] * readings["sigma"],
+        )
         displacement = preintegrate_dvl(
-            imu, int(self._nodes[a]["t_ns"]), readings["t_ns"].copy(), readings["z"][:, :3].copy(),
-            self._rig["inflate"][0, DVL] * readings["sigma"], x[0]["b_g"], self._rig,
-            self._config.dvl_between == "straight",
+            imu, int(self._nodes[a]["t_ns"]), *velocities, x[0]["b_g"], self._rig,
+            self._config.dvl_between == "straight", self._walk.take(*velocities),
         )  # fmt: skip
         N = displacement[0]["N"]
         f = steps.add_factor(self._w, self._nodes, self._factors, k, DVL, TIGHT if tight else LOOSE)

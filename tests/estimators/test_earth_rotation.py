@@ -204,7 +204,7 @@ def test_a_displacement_is_over_the_world_when_the_gyro_senses_the_stars() -> No
     R_i, t_ns = path.R_WB(np.zeros(1))[0], over_W["t_ns"].copy()
 
     def displaced(samples: np.ndarray) -> np.ndarray:
-        return preintegrate_dvl(samples, 0, t_ns, v_WB_B, np.zeros_like(v_WB_B), b_g, record, False)
+        return preintegrate_dvl(samples, 0, t_ns, v_WB_B, np.zeros_like(v_WB_B), b_g, record, False, np.zeros(3))
 
     expected, sensed = displaced(over_W), displaced(over_C)
     found = displaced(over_world(over_C, R_i, b_g, record))

@@ -98,7 +98,7 @@ def test_a_keyframe_of_just_the_windows_age_stays() -> None:
 
 
 def test_an_interval_sums_from_the_reading_at_its_beginning_to_the_last_before_its_end() -> None:
-    one = keyframes(dvl=["preintegrated-loose"], keyframe_period_s=0.5)
+    one = keyframes(dvl=["preintegrated-loose"], keyframe_period_s=0.5, dvl_between="held")
     orders = [order for t in range(100, 1001, 100) for order in at(one, t, (DVL, t))]
     assert one.not_given_out() == []  # the reading at the beginning is not to be used by itself as well
     assert [t for what, k, t in orders if (what, k) == (SUMMED, 0)] == [100, 200, 300, 400]

@@ -8,14 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 from driver import run_log
-from fathom.datasets import Log
-from fathom.datasets.log import ImuStream
+from fathom.datasets import Belief, Log
+from fathom.datasets.log import DvlStream, ImuStream
+from fathom.datasets.rig import Rig
+from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
-from fathom.datasets.state import THETA, VELOCITY
+from fathom.datasets.state import THETA, VELOCITY, NavState
 from fathom.estimators import create
 from fathom.estimators.unknown_start import StartError
 
+GRAVITY = 9.81
 LOST_RAD = np.pi / np.sqrt(3)
 
 
@@ -70,6 +73,24 @@ def test_sums_of_the_dvl_need_a_heading_on_every_solver(log: Log) -> None:
     for name, options in (("isam2", {}), ("batch", {}), ("batch", {"engine": "window"}), ("window", {})):
         with pytest.raises(StartError, match="heading"):
             run_log(lost(log), create(name, dvl=["preintegrated-loose"], **options))
+
+
+@pytest.mark.parametrize("name", ["window", "fls"])
+def test_a_window_does_not_sum_the_dvl_along_a_heading_that_is_lost_on_the_way(name: str) -> None:
+    """At rest, where nothing tells a gyro bias about the vertical from a turn, known to 0.05 rad/s: 45° in 16 s."""
+    imu_ns, dvl_ns = 10_000_000 * np.arange(1, 2501), 200_000_000 * np.arange(1, 126)
+    f_I, still = np.tile([0.0, 0.0, GRAVITY], (len(imu_ns), 1)), np.zeros((len(dvl_ns), 3))
+    sigma = np.repeat([1e-3, 1e-3, 0.1, 1e-2, 0.05], 3)
+    prior = Belief(0, NavState(np.eye(3), *np.zeros((4, 3))), np.diag(sigma**2))
+    imu, dvl = ImuStream(imu_ns, 0 * f_I, f_I), DvlStream(dvl_ns, dvl_ns, still, np.full_like(still, 0.01))
+    log = Log("at rest", Rig(IMU_GRADES["consumer"], gravity=GRAVITY), imu, dvl, prior=prior)
+    options: dict[str, Any] = {"factors": ["dvl"], "keyframe_period_s": 1.0}
+    refused = run_log(log, create(name, dvl=["preintegrated-loose"], **options))
+    assert refused.status == "diverged"
+    assert refused.failed_at_s == pytest.approx(16.7, abs=2.0)
+    assert "heading is lost, its sigma is over 45°" in str(refused.cause)
+    assert "`dvl: [velocity]`" in str(refused.cause)
+    assert run_log(log, create(name, **options)).status == "done"
 
 
 @pytest.mark.parametrize("name", ["eskf", "ukf"])

@@ -96,11 +96,11 @@ def test_preintegrated_dvl_navigates_about_as_well_as_velocity() -> None:
     log = simulate(replace(TACTICAL, duration_s=60.0), seed=2)
     results = {
         "velocity": run_log(log, create("fls", keyframe_period_s=1.0)),
-        "held": run_log(log, create("fls", dvl=["preintegrated-loose"])),
-        "straight": run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between="straight")),
+        "held": run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between="held")),
+        "straight": run_log(log, create("fls", dvl=["preintegrated-loose"])),
         "both": run_log(log, create("fls", dvl=["preintegrated-loose", "velocity"])),
-        "tight": run_log(log, create("fls", dvl=["preintegrated-tight"])),
-        "tight straight": run_log(log, create("fls", dvl=["preintegrated-tight"], dvl_between="straight")),
+        "tight": run_log(log, create("fls", dvl=["preintegrated-tight"], dvl_between="held")),
+        "tight straight": run_log(log, create("fls", dvl=["preintegrated-tight"])),
         "tight both": run_log(log, create("fls", dvl=["preintegrated-tight", "velocity"])),
     }
     rmse = {name: rmse_m(log.truth, result.online) for name, result in results.items()}
@@ -288,7 +288,8 @@ def test_factor_jacobians_are_gtsams_numerical_derivatives(what: str, seed: int)
             np.arange(3) * 250_000_000,
         )
         b_g = 0.002 * rng.normal(size=3)
-        d = preintegrate_dvl(imu, 0, t_ns, rng.normal(size=(3, 3)), np.full((3, 3), 0.1), b_g, record, seed % 2 == 0)
+        v, sigma = rng.normal(size=(3, 3)), np.full((3, 3), 0.1)
+        d = preintegrate_dvl(imu, 0, t_ns, v, sigma, b_g, record, seed % 2 == 0, np.zeros(3))
         factor = tight_displacement_factor(0, 1, d, record)
     else:
         A = rng.normal(size=(15, 15))
@@ -415,16 +416,20 @@ def test_dvl_readings_out_of_order_are_summed_in_order() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "consistent"), [("straight", True), ("held", False)])
-def test_preintegration_is_consistent_when_straight_and_overconfident_when_held(mode: str, consistent: bool) -> None:
-    """Velocity NEES over 20 seeds: holding loses what the vehicle does between readings, and nobody counts that."""
-    total, n = 0.0, 20
+@pytest.mark.parametrize("kind", ["loose", "tight"])
+@pytest.mark.parametrize("mode", ["straight", "held"])
+def test_preintegration_is_consistent_on_a_steep_yo_yo(mode: str, kind: str) -> None:
+    """NEES of attitude and velocity over 20 seeds: what the vehicle does between readings is counted."""
+    steep, n = {"depth_m": 15.0, "shallow_m": 3.0, "climb_deg": 45.0, "wobble_deg": 8.0}, 20
+    totals = dict.fromkeys(("attitude", "velocity"), 0.0)
     for seed in range(n):
-        log = simulate(Scenario(mission="yo-yo", duration_s=60.0, imu="tactical"), seed=seed)
-        result = run_log(log, create("fls", dvl=["preintegrated-loose"], dvl_between=mode))
-        total += float(nees(error_states(log.truth, result.online), result.online.P, BLOCKS["velocity"])[49])
-    low, high = chi2.interval(0.999, 3 * n)
-    assert (low < total < high) == consistent, total / n
+        log = simulate(Scenario(mission="yo-yo", duration_s=50.0, imu="industrial", **steep), seed=seed)
+        online = run_log(log, create("fls", dvl=[f"preintegrated-{kind}"], dvl_between=mode)).online
+        for name in totals:
+            totals[name] += float(nees(error_states(log.truth, online), online.P, BLOCKS[name])[44])
+    for total in totals.values():
+        assert total < chi2.ppf(0.999, 3 * n), totals
+        assert total > 0.5 * chi2.ppf(0.001, 3 * n), totals  # a random walk is modest of a motion that is smooth
 
 
 @pytest.mark.slow

@@ -146,12 +146,13 @@ def test_the_imu_block_is_that_of_the_page(seed: int) -> None:
 def test_the_tight_displacement_is_that_of_the_page(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rig, rows, b_g = some_rig(rng), samples(rng, 20), 0.1 * rng.normal(size=3)
-    record, sigma, v_B = (
+    record, sigma, S, v_B = (
         compile_rig(rig, frozenset({"dvl"}), {}),
         np.array([[0.02, 0.03, 0.01]]),
+        np.array([0.004, 0.002, 0.001]),
         rng.normal(size=(1, 3)),
     )
-    sums = preintegrate_dvl(rows, 0, np.zeros(1, np.int64), v_B, sigma, b_g, record, False)
+    sums = preintegrate_dvl(rows, 0, np.zeros(1, np.int64), v_B, sigma, b_g, record, False, S)
     d, K = sums[0], given_rotation(sums[0]["N"])[0]
 
     R, dp, W_k, pieces = I3, np.zeros(3), np.zeros((3, 3)), []
@@ -164,7 +165,7 @@ def test_the_tight_displacement_is_that_of_the_page(seed: int) -> None:
         dp, W_k, R = dp + dt * R_s @ v_B[0], W_k + dt * R_s, R @ exp(dt * w)  # (5)
     u = [dp - half for half, *_ in pieces]
     q = np.array([piece[3] for piece in pieces])
-    N_pp = W_k @ np.diag(sigma[0] ** 2) @ W_k.T + sum(
+    N_pp = W_k @ np.diag(sigma[0] ** 2 + S * rows["dt_s"].sum() / 3) @ W_k.T + sum(
         q_ * (u_ @ u_ * I3 - np.outer(u_, u_)) for q_, u_ in zip(q, u, strict=True)
     )  # (18)
     N_phi_p = skew(q @ np.array(u))

@@ -8,7 +8,7 @@ import pytest
 from fathom.datasets import ImuNoise, Mounting, NavState, Rig
 from fathom.estimators import FACTORS
 from fathom.estimators.graph.gtsam_border import insert_state, tight_displacement_factor
-from fathom.estimators.physics.dvl_preintegration import given_rotation, preintegrate_dvl
+from fathom.estimators.physics.dvl_preintegration import UNKNOWN_WALK, VelocityWalk, given_rotation, preintegrate_dvl
 from fathom.estimators.physics.imu import BLOCK, HELD_RATE, compile_rig, integrate
 from fathom.estimators.physics.measurements import tight_dvl_residual
 from paths import Path, random_rig, random_rotation
@@ -28,9 +28,10 @@ def displacement_of(
     rig: Rig,
     straight: bool,
     start_ns: int = 0,
+    walk: np.ndarray = ZERO,
 ) -> np.ndarray:
     spread = np.full((len(t_ns), 3), sigma)
-    return preintegrate_dvl(imu, start_ns, t_ns, v_WB_B, spread, b_g, compile_rig(rig, FACTORS, {}), straight)
+    return preintegrate_dvl(imu, start_ns, t_ns, v_WB_B, spread, b_g, compile_rig(rig, FACTORS, {}), straight, walk)
 
 
 def sum_up(
@@ -84,6 +85,75 @@ def test_interval_ends_on_the_keyframe_not_on_the_last_reading() -> None:
     straight, _ = sum_up(imu, t_ns, v_WB_B, 0.01, np.zeros(3), rig, straight=True)
     assert held[0] == pytest.approx(0.471 * 1.0 + 0.529 * 2.0, abs=1e-12)
     assert straight[0] == pytest.approx(0.130 * 1.0 + 0.341 * 1.5 + 0.529 * 2.0, abs=1e-12)
+
+
+# --- what the velocity does between readings ------------------------------------------------------------------------
+
+
+STRAYS = np.array([0.02, 0.05, 0.01])
+"""m²/s³ along the axes of B."""
+
+
+@pytest.mark.parametrize(("straight", "share"), [(False, 3.0), (True, 12.0)])
+def test_what_is_lost_between_readings_has_the_closed_form(straight: bool, share: float) -> None:
+    """S Δt³/3 held and S Δt³/12 straight, each reading's; before the first and after the last it is always held."""
+    rig = Rig(ImuNoise(1e-9, 1e-3, 1e-6, 1e-5, 1e-4, 1e-2))
+    imu = Path(0).imu(DT * np.arange(1, 101), DT, rig, ZERO, ZERO)
+    imu["w_WI_I"] = 0.0
+    t_ns = np.array([100_000_000, 400_000_000, 900_000_000], dtype=np.int64)
+    d = displacement_of(imu, t_ns, np.ones((3, 3)), 0.0, ZERO, rig, straight, walk=STRAYS)[0]
+    lost = (0.1**3 + 0.1**3) / 3 + (0.3**3 + 0.5**3) / share
+    np.testing.assert_allclose(d["N"][3:, 3:], lost * np.diag(STRAYS), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_what_is_lost_is_what_monte_carlo_finds_as_the_vehicle_turns(straight: bool) -> None:
+    """A velocity that walks in B at IMU rate, read without noise at 5 Hz."""
+    rng, runs = np.random.default_rng(5), 1500
+    rig = Rig(ImuNoise(1e-9, 1e-3, 1e-6, 1e-5, 1e-4, 1e-2))
+    imu, t_ns, _ = second_of(Path(3), rig, ZERO, 5.0)
+    t_ns = np.append(t_ns, 1_000_000_000)
+    claimed = displacement_of(imu, t_ns, np.zeros((6, 3)), 0.0, ZERO, rig, straight, walk=STRAYS)[0]["N"][3:, 3:]
+    fine_ns, errors = imu["t_ns"] - imu["t_ns"][0], np.empty((runs, 3))
+    for run in range(runs):
+        v = np.vstack([ZERO, np.cumsum(rng.normal(size=(100, 3)) * np.sqrt(STRAYS * DT), axis=0)])
+        true, _ = sum_up(imu, np.append(fine_ns, 1_000_000_000), v, 0.0, ZERO, rig, True)
+        errors[run] = sum_up(imu, t_ns, v[::20], 0.0, ZERO, rig, straight)[0] - true
+    whitened = np.linalg.solve(np.linalg.cholesky(claimed), errors.T)
+    assert np.abs(whitened @ whitened.T / runs - np.eye(3)).max() < 5 / np.sqrt(runs)
+
+
+def test_a_reading_shared_by_two_sums_leaves_many_of_them_right() -> None:
+    """N seconds of n readings each: the noise of all, N n σ² Δt², whoever shares one with his neighbour."""
+    rig, sigma = Rig(ImuNoise(1e-9, 1e-3, 1e-6, 1e-5, 1e-4, 1e-2)), 0.02
+    imu = Path(0).imu(DT * np.arange(1, 101), DT, rig, ZERO, ZERO)
+    imu["w_WI_I"] = 0.0
+    t_ns = np.arange(6) * 200_000_000
+    _, N_pp = sum_up(imu, t_ns, np.ones((6, 3)), sigma, ZERO, rig, straight=True)
+    np.testing.assert_allclose(N_pp, 5 * (sigma * 0.2) ** 2 * np.eye(3), rtol=1e-6, atol=1e-12)
+
+
+def test_the_walk_is_found_from_the_readings_so_far() -> None:
+    """From noisy readings of a walk of known density, by axis; nothing of the noise of a velocity that stays."""
+    rng, sigma, dt = np.random.default_rng(2), np.array([0.01, 0.02, 0.005]), 0.2
+    t_ns = np.arange(4000) * 200_000_000
+    v = np.cumsum(rng.normal(size=(4000, 3)) * np.sqrt(STRAYS * dt), axis=0) + sigma * rng.normal(size=(4000, 3))
+    walk, still = VelocityWalk(), VelocityWalk()
+    found = [walk.take(t_ns[k : k + 5], v[k : k + 5], np.tile(sigma, (5, 1))) for k in range(0, 4000, 5)]
+    noise = sigma * rng.normal(size=(4000, 3))
+    none = [still.take(t_ns[k : k + 5], noise[k : k + 5], np.tile(sigma, (5, 1))) for k in range(0, 4000, 5)]
+    assert (np.median(found, axis=0) / STRAYS > 0.9).all()
+    assert (np.median(found, axis=0) / STRAYS < 1.5).all()  # the larger of two, so a little too large
+    assert (np.mean(none, axis=0) < 2 * sigma**2 / dt).all()
+    assert (walk.take(t_ns[-5:], v[-5:], np.tile(sigma, (5, 1))) > 0).all()  # readings that are known tell nothing new
+
+
+def test_before_a_second_reading_the_walk_is_not_taken_for_none() -> None:
+    walk = VelocityWalk()
+    first = walk.take(np.zeros(1, np.int64), np.ones((1, 3)), np.full((1, 3), 0.01))
+    assert (first == UNKNOWN_WALK).all()
+    begun = walk.take(np.array([10**9]), np.array([[1.5, 1.0, 1.0]]), np.full((1, 3), 0.01))
+    np.testing.assert_allclose(begun, [0.25 - 2e-4, 0.0, 0.0], atol=1e-12)
 
 
 @pytest.mark.slow

@@ -368,7 +368,8 @@ def test_rows_are_whitened_residuals_and_their_derivatives(what: str, seed: int)
     factors["form"], factors["fresh"] = AT_KEYFRAME, 1
     if what in ("loose", "tight"):
         t_ns, v = np.arange(3) * 250_000_000, rng.normal(size=(3, 3))
-        displacements = preintegrate_dvl(imu[1:], 0, t_ns, v, np.full((3, 3), 0.1), still, record, seed % 2 == 0)
+        sigma = np.full((3, 3), 0.1)
+        displacements = preintegrate_dvl(imu[1:], 0, t_ns, v, sigma, still, record, seed % 2 == 0, still)
         factors["form"] = TIGHT if what == "tight" else LOOSE
         K, C = given_rotation(displacements[0]["N"])
         factors["K"], factors["cov"] = K, C if what == "tight" else displacements[0]["N"][3:, 3:]
