@@ -84,7 +84,7 @@ RUN |= {
         ("heading_rmse_deg", {}, "no attitude in the reference"),
         ("anees_position", {}, "no covariance"),
         ("over_floor_position", {}, "no floor"),
-        ("nis_dvl", {}, "no innovations (smoothed, or no reading in time)"),
+        ("nis_dvl", {}, "no innovations (smoothed, or late readings that a smoother ties)"),
         ("x", {}, "not defined for this run"),
         ("x", {"missing": None}, "not defined for this run"),
     ],

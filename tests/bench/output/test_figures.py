@@ -239,7 +239,9 @@ def test_the_consistency_table_marks_the_overconfident(judged: tuple[pd.DataFram
     assert (consistent["anees_times"], consistent["anees_velocity_above"]) == (6, 0)
     assert wrong["anees_velocity_above"] >= 5
     assert wrong["nis_dvl"] > 5 > 1.2 > consistent["nis_dvl"] > 0.8
-    assert consistent["nis_gps"] is None  # it comes late
+    dof = sum(json.loads(text)["gps"] for text in rows[rows["label"] == "eskf"]["nis_dof"])  # late, and replayed
+    low, high = chi2.interval(0.999, dof)
+    assert low < consistent["nis_gps"] * dof < high
     assert summary["rts", "smoothed"]["nis_dvl"] is None
     text = printed(rows, tmp_path, 120)
     lines = text[text.index(": consistency") :].splitlines()
@@ -250,8 +252,8 @@ def test_the_consistency_table_marks_the_overconfident(judged: tuple[pd.DataFram
     assert f"{wrong['nis_dvl']:.3g}" in of["overconfident"]
     shares = [100 * consistent[f"within_{k}sigma_position"] for k in (1, 2, 3)]
     assert of["eskf"].rstrip().endswith(f"{shares[0]:.0f} {shares[1]:.0f} {shares[2]:.1f}")
-    assert of["dead-reckoning"].count("–") == 5 + 3 + 1
-    assert "gps" not in lines[2]
+    assert of["dead-reckoning"].count("–") == 5 + 4 + 1
+    assert "gps" in lines[2]
 
 
 def test_the_widest_consistency_table_fits_120_columns(judged: tuple[pd.DataFrame, Path], tmp_path: Path) -> None:
