@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from time import perf_counter_ns, thread_time_ns
 from traceback import format_exception
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -329,7 +329,8 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
 class _Idle:
     """Steps that do nothing."""
 
-    counts: ClassVar[dict[str, int]] = {}
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
 
     def step(self, epoch: Epoch) -> None:
         """Do nothing."""
