@@ -241,7 +241,7 @@ for run in plan.runs()[:2]:
 def held(what="label, seed, output, status, finished"):
     if not (out / "t" / "runs.sqlite").is_file():
         return []
-    with closing(sqlite3.connect(out / "t" / "runs.sqlite")) as store:
+    with closing(sqlite3.connect(out / "t" / "runs.sqlite", timeout=60)) as store:
         if not store.execute("SELECT 1 FROM sqlite_master WHERE name = 'runs'").fetchone():
             return []
         return store.execute(f"SELECT {what} FROM runs").fetchall()
@@ -257,9 +257,10 @@ for k in range(kills):
     before = len(held("1"))
     child = os.fork()
     if child == 0:
-        os.setsid()
+        os.setpgid(0, 0)
         sweep.run_experiment(plan, out=out, jobs=2)
         os._exit(0)
+    os.setpgid(child, child)  # whichever comes first: it may be killed before it has run at all
     if longest_s is None:  # how long is a moment on this machine, as busy as it is
         wait_for(2)
         longest_s = time.monotonic() - begun
@@ -286,7 +287,7 @@ def test_killed_at_a_hundred_moments_no_run_is_lost_none_doubled_and_the_table_i
     kills, runs = 50, 6 * 30  # of this part: two stores are killed side by side
     (tmp_path / "killed.py").write_text(KILLED)
     command = [sys.executable, str(tmp_path / "killed.py"), json.dumps(content), str(tmp_path / "out"), str(kills)]
-    printed = subprocess.run([*command, str(part)], capture_output=True, text=True, check=True, timeout=900).stdout
+    printed = subprocess.run([*command, str(part)], stdout=subprocess.PIPE, text=True, check=True, timeout=900).stdout
     states = [json.loads(line) for line in printed.splitlines()]
     assert len(states) == kills
     before: set[tuple[Any, ...]] = set()
