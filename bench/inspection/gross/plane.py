@@ -481,12 +481,14 @@ def _size_and_turn(sketch: Sketch, course: Course, fixes: Fixes, now: Match) -> 
     """Return a path of another length, or one that is turned."""
     log, whose, size = sketch.log, _whose(sketch.log, fixes), abs(now.z)
     if abs(size - 1) > SCALE_MATTERS:
+        climb = climb_scale(sketch)
+        if climb is not None and abs(climb - 1) < SCALE_MATTERS and not course.compass:
+            return []  # its speed is right by its climbs, but a path that the gyro alone turns may bend
         near = [unit for unit, ratio in Speeds.units.items() if ratio != 1 and abs(size / ratio - 1) < 0.1]
         near += ["m/s"] if abs(size / 100 - 1) < 0.1 or abs(size / 1000 - 1) < 0.1 else []
         guess = f" That is the ratio of {near[0]} to what is stated." if near else ""
         message = f"The DVL's path must be scaled by {size:.4g} to be as long as the {whose}'s.{guess}"
         fix = f"streams.dvl.velocity.unit: {near[0]}" if near else f"streams.dvl.velocity.scale: {size:.4g}"
-        climb = climb_scale(sketch)
         if not near and climb is not None and abs(climb / size - 1) > 2 * SCALE_MATTERS:
             message += f" By the depth sensor its climb needs {climb:.3g}: other axes, or speeds along beams."
             fix = ""

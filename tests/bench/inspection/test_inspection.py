@@ -131,7 +131,7 @@ FAULTS: list[tuple[str, dict[str, Any], str]] = [
     ("depth", {"limit_m": 15.0}, "depth is clipped"),
     ("depth", {"quantum_m": 0.5}, "comes in steps of 0.5 m"),
     ("depth", {"quantum_m": 5.0}, "takes only 4 values"),
-    ("gps", {"outlier_probability": 0.05}, "stand out of their neighbours"),
+    ("gps", {"outlier_probability": 0.1}, "stand out of their neighbours"),
     ("gps", {"repeat_probability": 0.2}, "equal the one before exactly"),
     ("gps", {"quantum_m": 10.0}, "comes in steps of 10 m"),
     ("heading", {"dropout_probability": 0.15}, "readings are missing"),
