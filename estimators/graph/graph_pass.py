@@ -92,6 +92,10 @@ class GraphPass:
         certain = np.flatnonzero(prior.P.diagonal() == 0.0)
         if len(certain):
             raise Diverged(f"the prior has no variance in error component {certain[0]}; a graph needs some in each")
+        try:
+            np.linalg.cholesky(prior.P)
+        except np.linalg.LinAlgError:
+            raise Diverged("the prior's covariance is not positive definite") from None
         self._graph.add(prior_factor(as_record(prior), self._rig))
         with gtsam_failures():
             self._solve(0)

@@ -42,6 +42,9 @@ from .state import POSITION_0, THETA_0
 MANOEUVRE_S = 10.0
 """How long a vehicle is taken to manoeuvre alike, s: fifty readings of a usual DVL, which find S to a fifth."""
 
+OUTLIER_SIGMAS = 4.0
+"""What a difference counts for at most in the memory, over what is usual there: one right one in 16,000 is larger."""
+
 UNKNOWN_WALK = 0.1
 """m²/s³: S before a second reading has come; a vehicle that gets under way gains 0.3 m/s in a second."""
 
@@ -229,7 +232,8 @@ class VelocityWalk:
         S = Σ (Δv² − σ₁² − σ₂²) / Σ Δt,  by axis of B, not below 0                       [docs/conventions.md (18)]
 
     It is the larger of two: that of the interval itself, for a manoeuvre that has just begun, and one that forgets with
-    MANOEUVRE_S, for an interval of few readings. Both know the readings up to the interval's end and no later one.
+    MANOEUVRE_S, for an interval of few readings. An outlier is kept out of the second, and makes the covariance of its
+    own interval large, so that a sum protects itself. Both know the readings up to the interval's end and no later one.
     """
 
     def __init__(self) -> None:
@@ -245,6 +249,9 @@ class VelocityWalk:
                 dt = (at_ns - then_ns) * 1e-9
                 square = (v - v_then) ** 2 - variance - variance_then
                 own, own_s = own + square, own_s + dt
+                if self._time_s > 0.0:
+                    usual = np.maximum(self._squares / self._time_s, 0.0) * dt + variance + variance_then
+                    square = np.minimum(square, OUTLIER_SIGMAS**2 * usual)
                 kept = math.exp(-dt / MANOEUVRE_S)
                 self._squares, self._time_s = kept * self._squares + square, kept * self._time_s + dt
             if self._last is None or at_ns > self._last[0]:

@@ -115,11 +115,11 @@ def test_on_an_easy_log_it_is_gtsams(name: str) -> None:
 def test_a_correction_of_many_metres_invents_no_tilt() -> None:
     """Two minutes without a DVL, then a fix that moves the estimate by some 30 m: attitude NEES in the minute after it.
 
-    Per degree of freedom. Over six seeds it is 0.8 and 4.3; these are the two with the largest errors before the fix.
+    Per degree of freedom. Over eight seeds it is 1.3 and 2.3; these are the two where the factors part most.
     """
     scenario = Scenario(duration_s=170.0, imu="tactical", surface_every_s=110.0, leg_m=40.0, dvl=None)
     found: dict[str, list[float]] = {"fathom": [], "gtsam": []}
-    for seed in (1000, 1003):
+    for seed in (1000, 1001):
         log = simulate(scenario, seed)
         for factor, values in found.items():
             factors = frozenset({"depth", "gps", "heading"})

@@ -183,22 +183,23 @@ def test_a_gps_without_height_works_under_a_loss(loss: Loss) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [0.0, 0.5, 3.0])
-def test_preintegrated_dvl_takes_the_dvls_loss(lag_s: float) -> None:
-    """Once the biases are known, one velocity in forty is 5 m/s off, so one displacement in eight is 1 m off."""
+def test_preintegrated_dvl_survives_outliers_and_takes_the_dvls_loss(lag_s: float) -> None:
+    """Once the biases are known, one velocity in forty is 5 m/s off, so one displacement in eight is 1 m off.
+
+    The walk between its readings makes the covariance of such a sum large, and of no other: it protects itself.
+    """
     log = simulate(SURFACE, seed=4)
     z = log.dvl.z.copy()
     z[112::40, 0] += 5.0
     spoilt = replace(log, dvl=replace(log.dvl, z=z))
-    options = {"lag_s": lag_s, "dvl": ["preintegrated-loose"], "dvl_between": "straight"}
+    options = {"lag_s": lag_s, "dvl": ["preintegrated-loose"]}
     robust = run_log(spoilt, create("fls", robust={"dvl": "cauchy"}, **options))
-    plain, ruined = run_log(log, create("fls", **options)), run_log(spoilt, create("fls", **options))
+    plain, spoiled = run_log(log, create("fls", **options)), run_log(spoilt, create("fls", **options))
     assert robust.status == "done", robust.cause
-    error = {k: np.abs(r.online.v_WB_W - plain.online.v_WB_W).max() for k, r in {"r": robust, "p": ruined}.items()}
-    if lag_s < 1.0:  # a displacement leaves before it has been heard
-        assert error["r"] < 0.6 * error["p"], error
-    else:
-        assert error["r"] < 0.3 * error["p"], error
-        assert len(z[112::40]) <= robust.counts["outliers_dvl"] <= 2 * len(z[112::40])
+    late = plain.online.t_ns > log.start_ns + 20 * 10**9
+    for result in (robust, spoiled):
+        assert np.abs(result.online.v_WB_W - plain.online.v_WB_W)[late].max() < 0.02
+    assert np.abs(robust.online.v_WB_W - spoiled.online.v_WB_W).max() > 1e-4
 
 
 def test_tukey_never_hears_a_sensor_that_it_starts_too_far_from() -> None:
