@@ -64,7 +64,12 @@
         traces.unshift({ type: "scatter", mode: "lines", name: plain(kind), x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
         traces.push({ type: "scatter", mode: "markers", name: "start", x: truth[0].slice(0, 1), y: truth[1].slice(0, 1), marker: { color: ink, size: 9 }, hoverinfo: "name" });
       }
-      const layout = { xaxis: { title: { text: axes.east } }, yaxis: { title: { text: axes.north }, scaleanchor: "x" } };
+      // margins of their own: where one axis follows the other, margins that follow labels move both without end
+      const layout = {
+        xaxis: { title: { text: axes.east }, automargin: false },
+        yaxis: { title: { text: axes.north }, scaleanchor: "x", automargin: false },
+        margin: { l: 80, r: 12, t: 24, b: 56 },
+      };
       if (tracks.some((track) => !track.near)) { // one that got lost may leave the picture
         const inside = tracks.filter((track) => track.near).map((track) => track.p);
         if (truth) inside.push(truth);
