@@ -68,21 +68,20 @@ def mostly_outside(rows: Sequence[Record]) -> list[str]:
 
 
 def waited(summary: Sequence[Record]) -> list[str]:
-    """Return a line for each log on which steps took longer than the processor worked on them."""
-    lines = []
-    for (log,), of_log in groups(summary, "log").items():
-        parted = {
-            row["label"]: row["total_s"] / row["cpu_s"]
-            for row in of_log
-            if row["cpu_s"] and row["total_s"] > LONGEST_WAIT * row["cpu_s"]
-        }
-        if parted:
-            lines.append(
-                f"{log}: the steps of {len(parted)} estimators took up to {max(parted.values()):.2g} times their "
-                f"processor time ({max(parted, key=lambda label: parted[label])}): the machine was busy, or threads "
-                "waited for one another; compare costs by cpu_s in table.csv, or run again with fewer --jobs"
-            )
-    return lines
+    """Return a line if steps took longer than the processor worked on them, of where it was most."""
+    parted = {
+        (row["log"], row["label"]): row["total_s"] / row["cpu_s"]
+        for row in summary
+        if row["cpu_s"] and row["total_s"] > LONGEST_WAIT * row["cpu_s"]
+    }
+    if not parted:
+        return []
+    log, label = max(parted, key=lambda of: parted[of])
+    more = f", and {len(parted) - 1} more less" if len(parted) > 1 else ""
+    return [
+        f"the steps took up to {parted[log, label]:.2g} times their processor time ({log} / {label}{more}): the machine "
+        "was busy, or threads waited for one another; compare costs by cpu_s in table.csv, or run again with fewer --jobs"
+    ]
 
 
 def not_positive(summary: Sequence[Record]) -> list[str]:

@@ -15,4 +15,4 @@ def test_a_busy_machine_is_told_and_a_quiet_one_is_not() -> None:
     quiet = [cost("a", 1.0, 1.0), cost("b", 1.05, 1.0), cost("none", None, None)]
     assert waited(quiet) == []
     (line,) = waited([*quiet, cost("slow", 3.0, 1.0), cost("half", 1.5, 1.0)])
-    assert line.startswith("l: the steps of 2 estimators took up to 3 times their processor time (slow)")
+    assert line.startswith("the steps took up to 3 times their processor time (l / slow, and 1 more less): the machine")
