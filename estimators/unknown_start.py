@@ -24,7 +24,7 @@ MOST_YAW_RAD = np.radians(45.0)
 """Beyond it a yaw is as good as unknown; compasses have up to 15°, headings by GPS 5°."""
 MOST_VELOCITY_M_S = 1.0
 """Beyond it a vehicle that goes at 1.5 m/s may as well be at rest."""
-INSTEAD = "state a `prior` in log.yaml, begin later by `from_s`, or use isam2 or batch"
+INSTEAD = "state a `prior` in log.yaml, begin later by `from_s`, or use window, isam2 or batch"
 
 
 class StartError(ValueError):

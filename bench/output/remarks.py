@@ -79,8 +79,9 @@ def waited(summary: Sequence[Record]) -> list[str]:
     log, label = max(parted, key=lambda of: parted[of])
     more = f", and {len(parted) - 1} more less" if len(parted) > 1 else ""
     return [
-        f"the steps took up to {parted[log, label]:.2g} times their processor time ({log} / {label}{more}): the machine "
-        "was busy, or threads waited for one another; compare costs by cpu_s in table.csv, or run again with fewer --jobs"
+        f"the steps took up to {parted[log, label]:.2g} times their processor time ({log} / {label}{more}): the "
+        "machine was busy, or threads waited for one another; compare costs by cpu_s in table.csv, or run again with "
+        "fewer --jobs"
     ]
 
 
