@@ -24,7 +24,7 @@ MOST_YAW_RAD = np.radians(45.0)
 """Beyond it a yaw is as good as unknown; compasses have up to 15°, headings by GPS 5°."""
 MOST_VELOCITY_M_S = 1.0
 """Beyond it a vehicle that goes at 1.5 m/s may as well be at rest."""
-INSTEAD = "state a `prior` in log.yaml, begin later by `from_s`, or use window, isam2 or batch"
+INSTEAD = "state a `prior` in log.yaml, begin later by `from_s`, or use"
 
 
 class StartError(ValueError):
@@ -49,7 +49,10 @@ def refuse_unknown_heading(belief: Belief) -> None:
         StartError: the heading is unknown.
     """
     if not knows_heading(belief):
-        raise StartError(f"the heading is unknown since the start, and this estimator cannot find it so: {INSTEAD}")
+        raise StartError(
+            "the heading is unknown since the start, and this estimator cannot find it so: "
+            f"{INSTEAD} window, isam2 or batch"
+        )
 
 
 def refuse_lost_heading(belief: Belief) -> None:
@@ -77,4 +80,6 @@ def refuse_unknown_velocity(prior: Belief) -> None:
     """
     P = prior.P[VELOCITY, VELOCITY]
     if np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > MOST_VELOCITY_M_S**2:
-        raise StartError(f"the velocity at the start is unknown, and this estimator cannot find it so: {INSTEAD}")
+        raise StartError(
+            f"the velocity at the start is unknown, and this estimator cannot find it so: {INSTEAD} isam2 or batch"
+        )
