@@ -50,9 +50,10 @@ class Tree:
                 f"{self.name}: its pyproject.toml names no package-dir; nothing to compare with"
             ) from None
         for package, source in where.items():
-            link = folder.joinpath(*package.split("."))
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(self.root / source)
+            own = folder.joinpath(*package.split("."))
+            own.mkdir(parents=True, exist_ok=True)  # no link: another package may stand in it, and not in the tree
+            for entry in (self.root / source).iterdir():
+                (own / entry.name).symlink_to(entry)
         return folder
 
 

@@ -166,6 +166,27 @@ def test_the_worktree_of_a_comparison_that_was_killed_is_removed_by_the_next(rep
         assert not left.exists()
 
 
+def test_the_folder_that_leads_to_a_trees_packages_writes_nothing_into_the_tree(tmp_path: Path) -> None:
+    """`fathom` is a package of its own, in a folder of `bench`, and the other three stand in it."""
+    tree = tmp_path / "tree"
+    for package, word in (("bench/fathom", "top"), ("bench", "bench"), ("datasets", "datasets")):
+        (tree / package).mkdir(parents=True, exist_ok=True)
+        (tree / package / "__init__.py").write_text(f"word = {word!r}\n")
+    where = '{"fathom" = "bench/fathom", "fathom.bench" = "bench", "fathom.datasets" = "datasets"}'
+    (tree / "pyproject.toml").write_text(f"[tool.setuptools]\npackage-dir = {where}\n")
+    before = sorted(tree.rglob("*"))
+    side = revision.Tree("now", tree, Path(sys.executable), "")
+    for name in ("first", "second"):
+        folder = side.packages(tmp_path / name)
+        code = "import fathom, fathom.bench, fathom.datasets as d; print(fathom.word, fathom.bench.word, d.word)"
+        command = [sys.executable, "-B", "-S", "-c", code]
+        said = subprocess.run(
+            command, env={"PYTHONPATH": str(folder)}, capture_output=True, text=True, check=True
+        ).stdout
+        assert said.split() == ["top", "bench", "datasets"]
+    assert sorted(tree.rglob("*")) == before
+
+
 def test_an_unknown_revision_is_refused(repository: Path, tmp_path: Path) -> None:
     with pytest.raises(TimingError, match="nosuch: no such revision"), revision.checked_out("nosuch", tmp_path):
         pass
