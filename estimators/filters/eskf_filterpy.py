@@ -55,18 +55,15 @@ class FilterpyKalman(Kalman):
 
     def correct(self, state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> bool:
         """See `Kalman.correct`."""
-        ekf, at, dx = self._about(state), state.copy(), np.zeros(DIM)
-        for _ in range(self._iterations):
-            r, H, C = stack(at, rig, readings)
-            H[:, THETA] = H[:, THETA] @ right_jacobian(dx[THETA])  # of the error at the prediction
-            ekf = self._about(state)
-            if len(r) and not _update(ekf, r - H @ dx, H, C):
+        ekf, rows = self._about(state), stack(state, rig, readings)
+        for k in range(self._iterations):
+            if k > 0:
+                ekf, rows = self._about(state), stack_again(state, ekf.x, rig, readings)
+            if len(rows[0]) and not _update(ekf, *rows):
                 return False
-            dx = ekf.x
-            retract(state, dx, at)
         state[0]["P"] = ekf.P
-        self._inject(state, dx)
-        return bool(np.isfinite(dx).all())
+        self._inject(state, ekf.x)
+        return bool(np.isfinite(ekf.x).all())
 
     def _about(self, state: NDArray[Any]) -> Any:
         """Return filterpy's filter of the state's error, which is zero."""
@@ -101,3 +98,14 @@ def stack(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[Any]) -> tup
         r_all[part], H_all[part], C_all[part, part] = r, H, C
         begin = part.stop
     return r_all, H_all, C_all
+
+
+def stack_again(
+    state: NDArray[Any], dx: Array, rig: NDArray[Any], readings: NDArray[Any]
+) -> tuple[Array, Array, Array]:
+    """Return the rows of `stack`, linearised at the state moved by dx (15,), of the error at the state itself."""
+    at = state.copy()
+    retract(state, dx, at)
+    r, H, C = stack(at, rig, readings)
+    H[:, THETA] = H[:, THETA] @ right_jacobian(dx[THETA])
+    return r - H @ dx, H, C
