@@ -64,11 +64,10 @@
         traces.unshift({ type: "scatter", mode: "lines", name: plain(kind), x: truth[0], y: truth[1], line: { color: ink, width: 5 }, opacity: 0.3, hoverinfo: "skip" });
         traces.push({ type: "scatter", mode: "markers", name: "start", x: truth[0].slice(0, 1), y: truth[1].slice(0, 1), marker: { color: ink, size: 9 }, hoverinfo: "name" });
       }
-      // margins of their own: where one axis follows the other, margins that follow labels move both without end
+      // where one axis follows the other, margins that follow the labels of both move without end
       const layout = {
         xaxis: { title: { text: axes.east }, automargin: false },
         yaxis: { title: { text: axes.north }, scaleanchor: "x", automargin: false },
-        margin: { l: 80, r: 12, t: 24, b: 56 },
       };
       if (tracks.some((track) => !track.near)) { // one that got lost may leave the picture
         const inside = tracks.filter((track) => track.near).map((track) => track.p);
@@ -147,11 +146,12 @@
     const axis = { gridcolor: grid, linecolor: line, zerolinecolor: line, automargin: true, exponentformat: "none" };
     const named = traces.filter((trace) => trace.showlegend !== false);
     const widest = Math.max(...named.map((trace) => trace.name.length), 1) * 7 + 60;
-    const lines = Math.ceil(named.length / Math.max(1, Math.floor(plot.clientWidth / widest)));
+    const columns = Math.max(1, Math.floor((plot.clientWidth - 72) / (widest + 40)));  // less margins; with its line
+    const lines = Math.ceil(named.length / columns);
     const base = plot.matches(".tall") ? 560 : 480;
     const out = {
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: ink, family: "inherit", size: 13 },
-      margin: { l: 60, r: 12, t: 24, b: 48 }, width: plot.clientWidth, height: base + 22 * lines,
+      margin: { l: 60, r: 12, t: 24, b: 48 + 22 * lines }, width: plot.clientWidth, height: base + 22 * lines,
       hovermode: "closest", hoverlabel: { bgcolor: paper, font: { color: ink }, bordercolor: line, namelength: -1 },
       legend: { orientation: "h", yref: "container", y: 0, yanchor: "bottom", x: 0, tracegroupgap: 0, entrywidth: Math.min(widest, plot.clientWidth - 20), entrywidthmode: "pixels" },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: line, activecolor: ink }, uirevision: plot.dataset.kind,
