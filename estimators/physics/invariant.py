@@ -117,41 +117,34 @@ def move(state: NDArray[Any], error: Array, out: NDArray[Any]) -> None:
 @compiled
 def inject_moved(state: NDArray[Any], error: Array) -> None:
     """`move` the state by an error (15,), and carry P, of our error, to where it is then, to second order."""
-    xi, K, KP, P = np.empty(DIM), np.empty((DIM, DIM)), np.empty((DIM, DIM)), state[0].P[:]
+    xi, K, P = np.empty(DIM), np.empty((DIM, DIM)), state[0].P[:]
     A = to_invariant(state[0].R_WB[:], state[0].v_WB_W[:])
     as_invariant(state, error, xi)
     retract_invariant(state, xi, state)
     error_after_invariant(state, xi, K)
-    congruent(A, P, KP)
-    congruent(K, P, KP)
+    congruent(A, P)
+    congruent(K, P)
     spread_velocity(P, state[0].R_WB[:])
 
 
 @compiled
-def congruent(A: Array, P: Array, scratch: Array) -> None:
+def congruent(A: Array, P: Array) -> None:
     """P ← A P Aᵀ, for an A of this module: all but rows of rotation and velocity are the identity's."""
-    for i in range(DIM):
-        for j in range(DIM):
-            scratch[i, j] = P[i, j]
-    for first in (THETA_0, VELOCITY_0):
-        for i in range(first, first + 3):
+    AP = np.empty((DIM, DIM))
+    for _ in range(2):  # P ← (A P)ᵀ, twice
+        for i in range(DIM):
             for j in range(DIM):
-                total = 0.0
-                for k in range(3):
-                    total += A[i, THETA_0 + k] * P[THETA_0 + k, j] + A[i, VELOCITY_0 + k] * P[VELOCITY_0 + k, j]
-                scratch[i, j] = total
-    for i in range(DIM):
-        for j in range(DIM):
-            P[i, j] = scratch[i, j]
-    for first in (THETA_0, VELOCITY_0):
-        for i in range(first, first + 3):
+                AP[i, j] = P[i, j]
+        for first in (THETA_0, VELOCITY_0):
+            for i in range(first, first + 3):
+                for j in range(DIM):
+                    total = 0.0
+                    for k in range(3):
+                        total += A[i, THETA_0 + k] * P[THETA_0 + k, j] + A[i, VELOCITY_0 + k] * P[VELOCITY_0 + k, j]
+                    AP[i, j] = total
+        for i in range(DIM):
             for j in range(DIM):
-                total = 0.0
-                for k in range(3):
-                    total += (
-                        A[i, THETA_0 + k] * scratch[j, THETA_0 + k] + A[i, VELOCITY_0 + k] * scratch[j, VELOCITY_0 + k]
-                    )
-                P[j, i] = total
+                P[j, i] = AP[i, j]
     symmetrise(P)
 
 
@@ -255,7 +248,7 @@ def invariant_after_error(state: NDArray[Any], xi: Array, H: Array) -> None:
 
 @compiled
 def local_moved(state: NDArray[Any], other: NDArray[Any], error: Array) -> None:
-    """Fill our error (15,) by which `inject_invariant` moves the state to `other`."""
+    """Fill our error (15,) by which `move` takes the state to `other`."""
     xi, turned = np.empty(DIM), np.empty(3)
     local_invariant(state, other, xi)
     for i in range(DIM):
