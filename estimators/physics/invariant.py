@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import DIM, THETA, VELOCITY, Array
-from .blocks import clear, identity, set_block, set_product
+from .blocks import clear, identity, rows_times, set_block, set_product
 from .imu import sandwich
 from .so3 import (
     between_into,
@@ -34,7 +34,7 @@ from .so3 import (
     transform_into,
 )
 from .state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
-from .tie import mixed_jacobian_into
+from .tie import inverse_jacobian, mixed_jacobian_into
 
 PHI, NU = THETA, VELOCITY
 PHI_0, NU_0 = THETA_0, VELOCITY_0
@@ -225,25 +225,12 @@ def error_after_invariant(state: NDArray[Any], xi: Array, K: Array) -> None:
 def invariant_after_error(state: NDArray[Any], xi: Array, H: Array) -> None:
     """Fill H (15, 15), the inverse of `error_after_invariant`: the derivative of xi by our error at the state.
 
-    dphi = J_l⁻¹ R theta and dnu = J_l⁻¹ (e_v − Q dphi + [v]× R theta).
+    It is J_l⁻¹(xi) of SE_2(3), in W, times `to_invariant`.
     """
-    s, matrices, minus = state[0], np.empty((8, 3, 3)), np.empty(3)
-    J, Q, by_theta, S, A = matrices[0], matrices[1], matrices[2], matrices[3], matrices[4]
-    for i in range(3):
-        minus[i] = -xi[PHI_0 + i]
-    inverse_right_jacobian_into(minus, J)  # J_l⁻¹(phi)
-    mixed_jacobian_into(xi[PHI], xi[NU], Q, matrices[5:8])
-    product_into(J, s.R_WB[:], by_theta)
-    identity(H)
-    set_block(H, PHI_0, THETA_0, 1.0, by_theta)
-    set_block(H, NU_0, VELOCITY_0, 1.0, J)
-    skew_into(s.v_WB_W[:], S)
-    product_into(S, s.R_WB[:], A)
-    product_into(Q, by_theta, S)
-    for i in range(3):
-        for j in range(3):
-            A[i, j] -= S[i, j]
-    set_product(H, NU_0, THETA_0, 1.0, J, A)
+    J, no_turn = np.empty((DIM, DIM)), np.empty((3, 3))
+    identity(no_turn)
+    inverse_jacobian(xi, no_turn, J)
+    rows_times(DIM, J, to_invariant(state[0].R_WB[:], state[0].v_WB_W[:]), H)
 
 
 @compiled
