@@ -27,7 +27,7 @@ from ..physics.invariant import carry_over
 from ..physics.kalman import correct, find_correction, propagate
 from ..physics.measurements import measure
 from ..physics.so3 import right_jacobian_into
-from ..physics.state import inject, retract
+from ..physics.state import THETA_0, inject, retract
 from .filter_pass import FilterOptions, FilterPass, Kalman
 
 
@@ -124,11 +124,10 @@ def correct_iterated(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[A
 @compiled
 def about_prediction(n: int, dx: Array, J: Array, r: Array, H: Array) -> None:
     """Make n rows of the error at x ⊕ dx rows of that at x: H ← H diag(J, I), r ← r − H dx, with J = J_r(theta)."""
-    x, y, z = THETA.start, THETA.start + 1, THETA.start + 2
     for row in range(n):
-        a, b, c = H[row, x], H[row, y], H[row, z]
+        a, b, c = H[row, THETA_0], H[row, THETA_0 + 1], H[row, THETA_0 + 2]
         for i in range(3):
-            H[row, THETA.start + i] = a * J[0, i] + b * J[1, i] + c * J[2, i]
+            H[row, THETA_0 + i] = a * J[0, i] + b * J[1, i] + c * J[2, i]
         for i in range(DIM):
             r[row] -= H[row, i] * dx[i]
 

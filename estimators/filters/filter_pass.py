@@ -220,7 +220,6 @@ class FilterPass:
         """Return INNOVATION rows of readings of the present time, given the state before them."""
         predicted, table = self._state.copy(), np.zeros(len(readings), INNOVATION)
         predicted["P"][0] = self._covariance(self._state)
-        table["kind"], table["t_ns"] = readings["kind"], readings["t_ns"]
         judge(readings, predicted, self._rig, table)
         return table
 

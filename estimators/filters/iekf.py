@@ -48,6 +48,7 @@ from ..physics.invariant import (
     to_invariant,
 )
 from ..physics.measurements import measure
+from ..physics.state import THETA_0
 from ..unknown_start import refuse_unknown_velocity
 from .eskf import ErrorStateKalman
 from .filter_pass import FilterOptions, FilterPass
@@ -96,9 +97,10 @@ def correct_invariant(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[
     either are H K A and H K.
     """
     predicted, P, dx, xi = state.copy(), np.empty((DIM, DIM)), np.zeros(DIM), np.zeros(DIM)
-    A, K, scratch = to_invariant(state[0].R_WB[:], state[0].v_WB_W[:]), np.empty((DIM, DIM)), np.empty((DIM, DIM))
-    P_theta = state[0].P[0, 0] + state[0].P[1, 1] + state[0].P[2, 2]
+    A, K, P_theta = to_invariant(state[0].R_WB[:], state[0].v_WB_W[:]), np.empty((DIM, DIM)), 0.0
     r, H, C, HK = np.empty(3), np.empty((3, DIM)), np.empty((3, 3)), np.empty((3, DIM))
+    for i in range(THETA_0, THETA_0 + 3):
+        P_theta += state[0].P[i, i]
     rounds = ROUNDS if P_theta > POORLY_KNOWN_RAD**2 else 1
     for _ in range(rounds):
         found, P[:] = np.zeros(DIM), predicted[0].P[:]
@@ -113,7 +115,7 @@ def correct_invariant(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[
             if not absorb(n, r, H, C, found, P):
                 return False
         turned = 0.0
-        for i in range(3):
+        for i in range(THETA_0, THETA_0 + 3):
             turned += (found[i] - dx[i]) ** 2
         dx[:] = found
         as_invariant(predicted, dx, xi)
@@ -121,7 +123,7 @@ def correct_invariant(state: NDArray[Any], rig: NDArray[Any], readings: NDArray[
         if turned < SETTLED_RAD**2:
             break
     error_after_invariant(state, xi, K)
-    congruent(A, P, scratch)
-    congruent(K, P, scratch)
+    congruent(A, P)
+    congruent(K, P)
     state[0].P[:] = P
     return bool(np.isfinite(dx.sum()))

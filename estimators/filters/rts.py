@@ -82,8 +82,8 @@ class RauchTungStriebelPass:
     """One pass of `RauchTungStriebelSmoother`."""
 
     def __init__(self, config: RauchTungStriebelSmoother, prior: Belief, rig: Rig) -> None:
-        self._kalman = InvariantKalman() if config.filter == "iekf" else ErrorStateKalman()
         self._is_invariant = config.filter == "iekf"
+        self._kalman = InvariantKalman() if self._is_invariant else ErrorStateKalman()
         self._forwards = FilterPass(config, prior, rig, self._kalman, self._remember_epoch)
         self.counts = self._forwards.counts
         self._pages: list[Page] = []

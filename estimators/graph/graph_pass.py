@@ -23,8 +23,8 @@ from ...datasets.trajectory import Trajectory
 from ..between_keyframes import carry_on
 from ..interface import OUTLIERS, Diverged
 from ..keyframes import AT_KEYFRAME, CARRIED, KEYFRAME, SOLVE, SUMMED, Keyframes
-from ..physics.dvl_preintegration import VelocityWalk, preintegrate_dvl
-from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, over_world, predict, split
+from ..physics.dvl_preintegration import VelocityWalk, preintegrate_readings
+from ..physics.imu import BLOCK, compile_rig, first_sample, integrate, predict, split
 from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import Loss, width
 from ..smoothers import GraphSmoother
@@ -232,19 +232,13 @@ class GraphPass:
     def _add_displacement(self, readings: NDArray[Any]) -> None:
         """Add the preintegrated-DVL factor of the interval just closed, of DVL readings in the order of their times."""
         last, new = self._window[-2], self._window[-1]
-        imu = over_world(last.imu, self._newest.R_WB, self._newest.b_g, self._rig)
         if np.isfinite(self._config.window_s):
             if self._belief is None:
                 self._belief = self._solver.belief(last.index, last.t_ns)
             refuse_lost_heading(self._belief)
-        velocities = (
-            readings["t_ns"].copy(),
-            readings["z"][:, :3].copy(),
-            self._rig["inflate"][0, DVL] * readings["sigma"],
-        )
-        displacement = preintegrate_dvl(
-            imu, last.t_ns, *velocities, self._newest.b_g, self._rig, self._config.dvl_between == "straight",
-            self._walk.take(*velocities),
+        displacement = preintegrate_readings(
+            readings, last.imu, last.t_ns, self._newest.R_WB, self._newest.b_g, self._rig,
+            self._config.dvl_between == "straight", self._walk,
         )  # fmt: skip
         if "preintegrated-tight" in self._config.dvl:
             factor = tight_displacement_factor(last.index, new.index, displacement, self._rig)

@@ -24,11 +24,10 @@ from ...datasets.state import ACCEL_BIAS, DIM, GYRO_BIAS, POSITION, THETA, VELOC
 from ..interface import Diverged, unknown_kind
 from ..physics.blocks import TOP, identity, rows_times
 from ..physics.dvl_preintegration import given_rotation
-from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, increments, predict, process_noise, rate_at_end, unbiased
+from ..physics.imu import BLOCK, HELD_ACCEL, HELD_RATE, arm_velocity, increments, predict, process_noise, unbiased
 from ..physics.invariant import invariant_after_error, local_invariant, spread_velocity, to_invariant
 from ..physics.measurements import measure, preintegrated_dvl_residual, tight_dvl_residual
 from ..physics.so3 import (
-    cross_into,
     exp_into,
     inverse_transform_into,
     log,
@@ -81,16 +80,14 @@ def equivalent_samples(
     rate_arm, lever, step, reached, lacking = vectors[6], vectors[7], vectors[8], vectors[9], vectors[10]
     R, R_last, turn, J = matrices[0], matrices[1], matrices[2], matrices[3]
     identity(R)
-    rate_at_end(before[0], rates[0], g.R_BI[:], reached)
-    cross_into(reached, g.p_BI_B[:], rate_arm)
+    arm_velocity(before[0], rates[0], g, rate_arm)
     for k in range(n):
         dt = dts[k + 1]
         increments(rates, forces, dts, k, phi, push, drift)
         exp_into(phi, turn)
         for i in range(3):
             push[i] += rate_arm[i]
-        rate_at_end(imu[k], rates[k + 1], g.R_BI[:], reached)
-        cross_into(reached, g.p_BI_B[:], rate_arm)
+        arm_velocity(imu[k], rates[k + 1], g, rate_arm)
         transform_into(turn, rate_arm, lever)
         for i in range(3):
             push[i] -= lever[i]

@@ -33,9 +33,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
+from ...datasets.epochs import DVL
 from ...datasets.state import Array, TimeArray
 from .blocks import clear, identity
-from .imu import HELD_RATE, turn_by
+from .imu import HELD_RATE, over_world, turn_by
 from .so3 import product_into, skew_into, transform_into
 from .state import POSITION_0, THETA_0
 
@@ -114,7 +115,7 @@ def preintegrate_dvl(
             share, ahead = 0.0, k  # of the next reading
             between = k + 1 if now_ns >= t_ns[k] else 0
             over_s[between] += dt
-            if straight and k + 1 < n and now_ns >= t_ns[k]:
+            if straight and 0 < between < n:
                 share, ahead = (0.5 * (now_ns + until_ns) - t_ns[k]) / (t_ns[k + 1] - t_ns[k]), k + 1
             for i in range(3):
                 for j in range(3):
@@ -244,8 +245,10 @@ class VelocityWalk:
         """Return S (3,) m²/s³ for the interval of these readings; they are those of `preintegrate_dvl`."""
         own, own_s = np.zeros(3), 0.0
         for at_ns, v, variance in zip(t_ns.tolist(), v_WB_B, sigma**2, strict=True):
-            if self._last is not None and at_ns > self._last[0]:
+            if self._last is not None:
                 then_ns, v_then, variance_then = self._last
+                if at_ns <= then_ns:  # it is known
+                    continue
                 dt = (at_ns - then_ns) * 1e-9
                 square = (v - v_then) ** 2 - variance - variance_then
                 own, own_s = own + square, own_s + dt
@@ -254,13 +257,26 @@ class VelocityWalk:
                     square = np.minimum(square, OUTLIER_SIGMAS**2 * usual)
                 kept = math.exp(-dt / MANOEUVRE_S)
                 self._squares, self._time_s = kept * self._squares + square, kept * self._time_s + dt
-            if self._last is None or at_ns > self._last[0]:
-                self._last = at_ns, v, variance
+            self._last = at_ns, v, variance
         walk = np.zeros(3) if self._time_s > 0.0 else np.full(3, UNKNOWN_WALK)
         for squares, time_s in ((own, own_s), (self._squares, self._time_s)):
             if time_s > 0.0:
                 walk = np.maximum(walk, squares / time_s)
         return walk
+
+
+def preintegrate_readings(
+    readings: NDArray[Any], imu: NDArray[Any], start_ns: int, R_i: Array, b_g: Array, rig: NDArray[Any],
+    straight: bool, walk: VelocityWalk,
+) -> NDArray[Any]:  # fmt: skip
+    """Sum the DVL's READING rows, in the order of their times, over the interval of a smoother that begins at R_i.
+
+    The other arguments, and what is returned, are those of `preintegrate_dvl`; `imu` still has the Earth's rate in it.
+    """
+    t_ns, v_WB_B = readings["t_ns"].copy(), readings["z"][:, :3].copy()
+    sigma = rig["inflate"][0, DVL] * readings["sigma"]
+    imu, S = over_world(imu, R_i, b_g, rig), walk.take(t_ns, v_WB_B, sigma)
+    return preintegrate_dvl(imu, start_ns, t_ns, v_WB_B, sigma, b_g, rig, straight, S)
 
 
 @compiled

@@ -9,7 +9,7 @@ and sculling corrections, and moves it to B at the two ends:
 
 Term by term this is what the centripetal and the tangential acceleration of I add up to, the gyro being differenced
 for the latter: the difference telescopes, so only the rates ω_i and ω_j at the ends are left. A sample is a mean, half
-of it late, so its rate is run straight on to its end by the sample before it (`rate_at_end`).
+of it late, so its rate is run straight on to its end by the sample before it (`arm_velocity`).
 
 The noise of these rates does not accumulate: ω_i's leaves with the block what it came with, as part of v_B at i, and
 ω_j's is fresh. A covariance that took both as process noise would grow with every block, however short. So neither is
@@ -175,10 +175,8 @@ def integrate(
         product_into(R_mid[k], half, R)
         T += dt
 
-    rate_at_end(before[0], rates[0], g.R_BI[:], drift)
-    cross_into(drift, g.p_BI_B[:], c_i)
-    rate_at_end(imu[n - 1] if n else before[0], rates[n], g.R_BI[:], drift)
-    cross_into(drift, g.p_BI_B[:], c_j)
+    arm_velocity(before[0], rates[0], g, c_i)
+    arm_velocity(imu[n - 1] if n else before[0], rates[n], g, c_j)
     block.T = T
     for i in range(3):  # from I to B: v and p are now of the block's end
         for j in range(3):
@@ -210,12 +208,17 @@ def unbiased(
 
 
 @inner
-def rate_at_end(row: Any, rate: Array, R_BI: Array, out: Array) -> None:
-    """Fill out (3,) with the rate at the end of a sample whose mean is `rate`, rad/s in B; docs/conventions.md (24)."""
+def arm_velocity(row: Any, rate: Array, g: Any, out: Array) -> None:
+    """Fill out (3,) with ω × l at the end of a sample whose mean is `rate`, rad/s in B; docs/conventions.md (24).
+
+    `g` is one record of RIG.
+    """
+    w = np.empty(3)
     for i in range(3):
-        out[i] = rate[i]
+        w[i] = rate[i]
         for j in range(3):
-            out[i] += R_BI[i, j] * row.alpha_I[j] * row.after_s
+            w[i] += g.R_BI[i, j] * row.alpha_I[j] * row.after_s
+    cross_into(w, g.p_BI_B[:], out)
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""Innovations: a reading against the belief before it: their NIS, docs/conventions.md (37), and their density (67)."""
+"""Innovations: a reading against the belief before it: their NIS, docs/conventions.md (37), and their density (73)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,6 @@ def innovations(belief: Belief, readings: NDArray[Any], rig: NDArray[Any]) -> ND
     Source: Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2.
     """
     table = np.zeros(len(readings), INNOVATION)
-    table["kind"], table["t_ns"] = readings["kind"], readings["t_ns"]
     judge(readings, as_record(belief), rig, table)
     return table[table["dof"] > 0]
 
@@ -74,7 +73,8 @@ def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table:
     """Fill a table of INNOVATION rows, one per reading; state and rig are records of length 1."""
     r, H, S, PH = np.empty(3), np.empty((3, DIM)), np.empty((3, 3)), np.empty(DIM)
     for m in range(len(readings)):
-        n, largest = measure(readings, m, state, rig, r, H, S), 0.0
+        t, n, largest = table[m], measure(readings, m, state, rig, r, H, S), 0.0
+        t.kind, t.t_ns = readings[m].kind, readings[m].t_ns
         for i in range(n):
             S[i, i] = project(H[i], state[0].P[:], S[i, i], PH)
             for j in range(DIM):
@@ -85,7 +85,6 @@ def judge(readings: NDArray[Any], state: NDArray[Any], rig: NDArray[Any], table:
                 S[k, i] = S[i, k]
         if largest > 0.0:  # a yaw looked at from the pole measures nothing
             decorrelate(n, r, H, S)
-            t = table[m]
             t.dof, t.nis, t.log_density = n, 0.0, -0.5 * n * LOG_2PI
             for i in range(n):
                 t.white[i] = r[i] / math.sqrt(S[i, i]) if S[i, i] > 0.0 else np.nan

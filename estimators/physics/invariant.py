@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import DIM, THETA, VELOCITY, Array
-from .blocks import clear, identity, set_block, set_product
+from .blocks import clear, identity, rows_times, set_block, set_product
 from .imu import sandwich
 from .so3 import (
     between_into,
@@ -34,7 +34,7 @@ from .so3 import (
     transform_into,
 )
 from .state import ACCEL_BIAS_0, GYRO_BIAS_0, POSITION_0, THETA_0, VELOCITY_0, symmetrise
-from .tie import mixed_jacobian_into
+from .tie import inverse_jacobian, mixed_jacobian_into
 
 PHI, NU = THETA, VELOCITY
 PHI_0, NU_0 = THETA_0, VELOCITY_0
@@ -117,41 +117,34 @@ def move(state: NDArray[Any], error: Array, out: NDArray[Any]) -> None:
 @compiled
 def inject_moved(state: NDArray[Any], error: Array) -> None:
     """`move` the state by an error (15,), and carry P, of our error, to where it is then, to second order."""
-    xi, K, KP, P = np.empty(DIM), np.empty((DIM, DIM)), np.empty((DIM, DIM)), state[0].P[:]
+    xi, K, P = np.empty(DIM), np.empty((DIM, DIM)), state[0].P[:]
     A = to_invariant(state[0].R_WB[:], state[0].v_WB_W[:])
     as_invariant(state, error, xi)
     retract_invariant(state, xi, state)
     error_after_invariant(state, xi, K)
-    congruent(A, P, KP)
-    congruent(K, P, KP)
+    congruent(A, P)
+    congruent(K, P)
     spread_velocity(P, state[0].R_WB[:])
 
 
 @compiled
-def congruent(A: Array, P: Array, scratch: Array) -> None:
+def congruent(A: Array, P: Array) -> None:
     """P ← A P Aᵀ, for an A of this module: all but rows of rotation and velocity are the identity's."""
-    for i in range(DIM):
-        for j in range(DIM):
-            scratch[i, j] = P[i, j]
-    for first in (THETA_0, VELOCITY_0):
-        for i in range(first, first + 3):
+    AP = np.empty((DIM, DIM))
+    for _ in range(2):  # P ← (A P)ᵀ, twice
+        for i in range(DIM):
             for j in range(DIM):
-                total = 0.0
-                for k in range(3):
-                    total += A[i, THETA_0 + k] * P[THETA_0 + k, j] + A[i, VELOCITY_0 + k] * P[VELOCITY_0 + k, j]
-                scratch[i, j] = total
-    for i in range(DIM):
-        for j in range(DIM):
-            P[i, j] = scratch[i, j]
-    for first in (THETA_0, VELOCITY_0):
-        for i in range(first, first + 3):
+                AP[i, j] = P[i, j]
+        for first in (THETA_0, VELOCITY_0):
+            for i in range(first, first + 3):
+                for j in range(DIM):
+                    total = 0.0
+                    for k in range(3):
+                        total += A[i, THETA_0 + k] * P[THETA_0 + k, j] + A[i, VELOCITY_0 + k] * P[VELOCITY_0 + k, j]
+                    AP[i, j] = total
+        for i in range(DIM):
             for j in range(DIM):
-                total = 0.0
-                for k in range(3):
-                    total += (
-                        A[i, THETA_0 + k] * scratch[j, THETA_0 + k] + A[i, VELOCITY_0 + k] * scratch[j, VELOCITY_0 + k]
-                    )
-                P[j, i] = total
+                P[j, i] = AP[i, j]
     symmetrise(P)
 
 
@@ -232,30 +225,17 @@ def error_after_invariant(state: NDArray[Any], xi: Array, K: Array) -> None:
 def invariant_after_error(state: NDArray[Any], xi: Array, H: Array) -> None:
     """Fill H (15, 15), the inverse of `error_after_invariant`: the derivative of xi by our error at the state.
 
-    dphi = J_l⁻¹ R theta and dnu = J_l⁻¹ (e_v − Q dphi + [v]× R theta).
+    It is J_l⁻¹(xi) of SE_2(3), in W, times `to_invariant`.
     """
-    s, matrices, minus = state[0], np.empty((8, 3, 3)), np.empty(3)
-    J, Q, by_theta, S, A = matrices[0], matrices[1], matrices[2], matrices[3], matrices[4]
-    for i in range(3):
-        minus[i] = -xi[PHI_0 + i]
-    inverse_right_jacobian_into(minus, J)  # J_l⁻¹(phi)
-    mixed_jacobian_into(xi[PHI], xi[NU], Q, matrices[5:8])
-    product_into(J, s.R_WB[:], by_theta)
-    identity(H)
-    set_block(H, PHI_0, THETA_0, 1.0, by_theta)
-    set_block(H, NU_0, VELOCITY_0, 1.0, J)
-    skew_into(s.v_WB_W[:], S)
-    product_into(S, s.R_WB[:], A)
-    product_into(Q, by_theta, S)
-    for i in range(3):
-        for j in range(3):
-            A[i, j] -= S[i, j]
-    set_product(H, NU_0, THETA_0, 1.0, J, A)
+    J, no_turn = np.empty((DIM, DIM)), np.empty((3, 3))
+    identity(no_turn)
+    inverse_jacobian(xi, no_turn, J)
+    rows_times(DIM, J, to_invariant(state[0].R_WB[:], state[0].v_WB_W[:]), H)
 
 
 @compiled
 def local_moved(state: NDArray[Any], other: NDArray[Any], error: Array) -> None:
-    """Fill our error (15,) by which `inject_invariant` moves the state to `other`."""
+    """Fill our error (15,) by which `move` takes the state to `other`."""
     xi, turned = np.empty(DIM), np.empty(3)
     local_invariant(state, other, xi)
     for i in range(DIM):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...datasets.compiling.decorators import compiled, inner
 from ...datasets.state import DIM, THETA, VELOCITY, Array
-from ..physics.blocks import clear, identity, set_block, set_product
+from ..physics.blocks import clear, identity, rows_times, set_block, set_product
 from ..physics.elimination import add_scaled, decorrelate
 from ..physics.imu import predict, process_noise
 from ..physics.invariant import as_invariant, congruent, error_after_invariant, local_invariant, to_invariant
@@ -123,11 +123,11 @@ def linearise_carried(
     g, H, F, end = factors[f], np.empty((3, DIM)), np.empty((DIM, DIM)), np.empty(1, STATE)
     predict(carries[f : f + 1], x_i, rig[0].gravity, F, end)
     n = measure(readings, f, end, rig, g.r[:], H, C)
-    multiply_rows(n, H, F, g.H[:])
+    rows_times(n, H, F, g.H[:])
     if g.fresh:
         HQ = np.empty((3, DIM))
         process_noise(carries[f : f + 1], x_i[0].R_WB[:], F)
-        multiply_rows(n, H, F, HQ)
+        rows_times(n, H, F, HQ)
         for i in range(n):
             for j in range(n):
                 for k in range(DIM):
@@ -138,18 +138,6 @@ def linearise_carried(
             for j in range(n):
                 C[i, j] = g.cov[i, j]
     return n
-
-
-@inner
-def multiply_rows(n: int, A: Array, F: Array, out: Array) -> None:
-    """out = A F for n rows."""
-    for i in range(n):
-        for j in range(DIM):
-            out[i, j] = 0.0
-        for k in range(DIM):
-            if A[i, k] != 0.0:
-                for j in range(DIM):
-                    out[i, j] += A[i, k] * F[k, j]
 
 
 @inner
@@ -176,7 +164,7 @@ def distance(factors: NDArray[Any], f: int, d_i: Array, d_j: Array) -> float:
 def linearise_tie(
     block: NDArray[Any], x_i: NDArray[Any], x_j: NDArray[Any], gravity: float, F: Array, Q: Array, c: Array
 ) -> None:
-    """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; docs/window.md (4).
+    """Fill the tie δ_j = F δ_i + c + noise(Q) that a BLOCK makes between two STATE records; docs/window.md (14).
 
     It is `tie_residual` solved for δ_j. Where x_j lies e = x_j ⊖ x⁻ off the prediction x⁻ from x_i, with the residual's
     rotation φ and velocity ν, an error (θ, e_v) that starts at x⁻ is carried there by the adjoint of SE_2(3), and noise
@@ -225,12 +213,12 @@ def carry_noise(end: NDArray[Any], R_j: Array, r: Array, Q: Array) -> None:
     set_block(M, THETA_0, THETA_0, 1.0, J)
     set_product(M, VELOCITY_0, THETA_0, 1.0, R_j, mixed)
     set_product(M, VELOCITY_0, VELOCITY_0, 1.0, R_j, turned)
-    congruent(M, Q, np.empty((DIM, DIM)))
+    congruent(M, Q)
 
 
 @compiled
 def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array, P: Array) -> None:
-    """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor; docs/window.md (10).
+    """Fill N(m, P) of the error at x from N(mean, anchor.P) of that at the anchor; docs/window.md (12).
 
     What is normal is the invariant error ξ of x from the anchor (`invariant`), which the error at the anchor turns into
     by its derivative there.
@@ -239,13 +227,13 @@ def linearise_prior(anchor: NDArray[Any], mean: Array, x: NDArray[Any], m: Array
         anchor, x: STATE records.
         mean, m, P: (15,), (15,), (15, 15).
     """
-    a, xi, at, K, scratch = anchor[0], np.empty(DIM), np.empty(DIM), np.empty((DIM, DIM)), np.empty((DIM, DIM))
+    a, xi, at, K = anchor[0], np.empty(DIM), np.empty(DIM), np.empty((DIM, DIM))
     as_invariant(anchor, mean, xi)
     local_invariant(anchor, x, at)
     error_after_invariant(x, at, K)
     copy_into(a.P[:], P)
-    congruent(to_invariant(a.R_WB[:], a.v_WB_W[:]), P, scratch)
-    congruent(K, P, scratch)
+    congruent(to_invariant(a.R_WB[:], a.v_WB_W[:]), P)
+    congruent(K, P)
     for i in range(DIM):
         m[i] = 0.0
         for j in range(DIM):

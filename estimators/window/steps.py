@@ -12,6 +12,7 @@ flat, and a function takes the arrays that it needs, not all there are.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,9 +147,15 @@ def split_samples(w: Records, imu: Records, first: int, t_ns: int) -> None:
             for m in range(w[0].n_imu, k, -1):
                 imu[m] = imu[m - 1]
             w[0].n_imu += 1
-            imu[k].dt_s, imu[k].t_ns = (t_ns - began_ns) * 1e-9, t_ns
             imu[k + 1].dt_s = (imu[k + 1].t_ns - t_ns) * 1e-9
-            imu[k].after_s -= imu[k + 1].dt_s
+            end_at(imu[k], began_ns, t_ns)
+
+
+@inner
+def end_at(sample: Any, began_ns: int, t_ns: int) -> None:
+    """Let a sample that began at began_ns end at t_ns, which lies within it."""
+    sample.after_s -= (sample.t_ns - t_ns) * 1e-9
+    sample.dt_s, sample.t_ns = (t_ns - began_ns) * 1e-9, t_ns
 
 
 @inner
@@ -168,8 +175,7 @@ def move_along(
         began_ns = imu[end].t_ns - round(imu[end].dt_s * 1e9)
         if began_ns < t_ns:
             part = imu[first : end + 1].copy()
-            part[end - first].dt_s, part[end - first].t_ns = (t_ns - began_ns) * 1e-9, t_ns
-            part[end - first].after_s -= (imu[end].t_ns - t_ns) * 1e-9
+            end_at(part[end - first], began_ns, t_ns)
     integrate(part, imu[first - 1 : first], biases[0], biases[1], rig, block)
 
 

@@ -20,8 +20,8 @@ from ...datasets.trajectory import Trajectory
 from ..between_keyframes import carry_on
 from ..interface import OUTLIERS, Diverged
 from ..keyframes import SUMMED, Keyframes
-from ..physics.dvl_preintegration import DISPLACEMENT, VelocityWalk, given_rotation, preintegrate_dvl
-from ..physics.imu import BLOCK, compile_rig, first_sample, over_world
+from ..physics.dvl_preintegration import DISPLACEMENT, VelocityWalk, given_rotation, preintegrate_readings
+from ..physics.imu import BLOCK, compile_rig, first_sample
 from ..physics.invariant import inject_moved, move
 from ..physics.state import STATE, as_belief, as_record, with_rate_noise
 from ..robust import LOSSES, width
@@ -177,18 +177,12 @@ class WindowPass:
         x = self._points[a : a + 1].copy()
         move(x, self._nodes[a]["d"], x)
         begin, end = (int(self._nodes["imu_from"][j & mask] - self._w["imu_gone"][0]) for j in (k, k + 1))
-        imu = over_world(self._imu[begin:end], x[0]["R_WB"], x[0]["b_g"], self._rig)
         if np.isfinite(self._config.window_s):
             x["P"] = self._nodes[a]["P"]
             refuse_lost_heading(as_belief(int(self._nodes[a]["t_ns"]), x))
-        velocities = (
-            readings["t_ns"].copy(),
-            readings["z"][:, :3].copy(),
-            self._rig["inflate"][0, DVL] * readings["sigma"],
-        )
-        displacement = preintegrate_dvl(
-            imu, int(self._nodes[a]["t_ns"]), *velocities, x[0]["b_g"], self._rig,
-            self._config.dvl_between == "straight", self._walk.take(*velocities),
+        displacement = preintegrate_readings(
+            readings, self._imu[begin:end], int(self._nodes[a]["t_ns"]), x[0]["R_WB"], x[0]["b_g"], self._rig,
+            self._config.dvl_between == "straight", self._walk,
         )  # fmt: skip
         N = displacement[0]["N"]
         f = steps.add_factor(self._w, self._nodes, self._factors, k, DVL, TIGHT if tight else LOOSE)
