@@ -135,6 +135,11 @@ def look_handle(label: str, look: Look) -> Line2D:
     return handle(label, look.marker, look.colour, True, look.dash)
 
 
+def band_handle(label: str, alpha: float) -> Line2D:
+    """Return the legend entry of a grey band."""
+    return Line2D([], [], color="black", alpha=alpha, linewidth=6, label=label)
+
+
 def save(figure: Figure, stem: Path) -> list[Path]:
     """Write a figure as PDF, with its fonts as TrueType, and as PNG, and return the files."""
     stem.parent.mkdir(parents=True, exist_ok=True)

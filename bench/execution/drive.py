@@ -9,7 +9,8 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from time import perf_counter_ns, thread_time_ns
 from traceback import format_exception
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -326,27 +327,15 @@ def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, colle
     return Ending("done")
 
 
-class _Idle:
-    """Steps that do nothing."""
-
-    def __init__(self) -> None:
-        self.counts: dict[str, int] = {}
-
-    def step(self, epoch: Epoch) -> None:
-        """Do nothing."""
-
-    def belief(self) -> Belief:
-        """Not asked for."""
-        raise NotImplementedError
-
-    def finish(self) -> Trajectory | None:
-        """Return None."""
+def _do_nothing(epoch: Epoch) -> None:
+    """Be a step of no estimator."""
 
 
 def _of_driving_ns(voyage: Voyage) -> int:
     """Return the processor time of a step that does nothing: the least of a hundred."""
     recorder, epochs = Recorder(0), [epoch._replace(tick=False) for epoch in voyage.epochs[:1]] * 100
-    _drive(_Idle(), replace(voyage, epochs=epochs), recorder, math.inf, None)
+    idle = cast(Pass, SimpleNamespace(step=_do_nothing))
+    _drive(idle, replace(voyage, epochs=epochs), recorder, math.inf, None)
     return min(recorder.step_cpu_ns, default=0)
 
 

@@ -218,6 +218,11 @@ def _reason(score: str, row: Record) -> str:
     return missing.get(score.replace("anees_", "nees_"), "not defined for this run")
 
 
+def judged(value: float, above: int, below: int) -> Cell:
+    """Return the cell of an ANEES, marked by how many of its times lie above and below the interval."""
+    return Cell(text(value), value, mark=(f"▲{above}" if above else "") + (f"▼{below}" if below else ""))
+
+
 # -- captions ---------------------------------------------------------------------------------------------------------
 
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from ..metrics.state_error import BLOCKS, DOF
-from ..results.convergence import JUDGED
+from ..results.convergence import JUDGED, limits
 from ..results.honesty import band_of, compared
 from ..results.summary import Record, groups
-from .cells import ABSENT, ONLINE, Cell, interval, lag, text
+from .cells import ABSENT, ONLINE, Cell, interval, judged, lag, text
 from .sheets import SHORT, Line, Sheet
 
 INDENT = "  "
 """Before an estimator's name, below that of the log."""
-FINISHED = (
-    f"a time or `all` beside a name: smoothed, with that look-ahead; k/n: of n runs k finished; {ABSENT}: none did"
-)
+BESIDE_NAMES = "a time or `all` beside a name: smoothed, with that look-ahead"
 
 
 def honesty(found: Sequence[Record]) -> Sheet | None:
@@ -30,13 +28,16 @@ def honesty(found: Sequence[Record]) -> Sheet | None:
     note = [
         f"mean over {times} fixed times of the ANEES over {seeds} seeds, per degree of freedom: 1 is consistent",
         "▲k, ▼k: at k of these times above (overconfident), below the band that 99 % of consistent ones never leave:",
-        f"{', '.join(bands)}",
-        FINISHED,
+        ", ".join(bands),
+        f"{BESIDE_NAMES}; k/n: of n runs k finished; {ABSENT}: none did",
     ]
 
     def cells(of: Sequence[Record]) -> list[Cell]:
         by_block = {row["block"]: row for row in of}
-        return [_anees(by_block[block]) for block in BLOCKS]
+        each = [by_block[block] for block in BLOCKS]
+        return [
+            Cell(ABSENT) if row["anees"] is None else judged(row["anees"], row["above"], row["below"]) for row in each
+        ]
 
     headings = ["estimator", *(SHORT.get(block, block) for block in BLOCKS)]
     return Sheet("honesty: ANEES", note, headings, _grouped(shown, cells, len(BLOCKS)))
@@ -46,11 +47,11 @@ def convergence(found: Sequence[Record]) -> Sheet | None:
     """Return what `results.convergence` found; None where convergence was not asked for."""
     if not found:
         return None
-    limits = ", ".join(f"{limit:g}°" for limit in sorted({row["limit_deg"] for row in found}))
     note = [
-        f"converged: the attitude's error stays below {limits} to the end; of all runs, [ ]: 95 % interval (Wilson)",
+        f"converged: the attitude's error stays below {limits(found)} to the end; of all runs, "
+        "[ ]: 95 % interval (Wilson)",
         "time (median), ATE and ANEES are of the runs that converge; ANEES per degree of freedom: 1 is consistent",
-        f"a time or `all` beside a name: smoothed, with that look-ahead; {ABSENT}: no run converged",
+        f"{BESIDE_NAMES}; {ABSENT}: no run converged",
     ]
 
     def cells(of: Sequence[Record]) -> list[Cell]:
@@ -64,13 +65,6 @@ def convergence(found: Sequence[Record]) -> Sheet | None:
 
     headings = ["estimator", "converged", "time\ns", "ATE\nm", *(f"ANEES\n{SHORT.get(b, b)}" for b in JUDGED)]
     return Sheet("convergence", note, headings, _grouped(found, cells, len(headings) - 1))
-
-
-def _anees(row: Record) -> Cell:
-    if row["anees"] is None:
-        return Cell(ABSENT)
-    mark = (f"▲{row['above']}" if row["above"] else "") + (f"▼{row['below']}" if row["below"] else "")
-    return Cell(text(row["anees"]), row["anees"], mark=mark)
 
 
 def _grouped(rows: Sequence[Record], cells: Callable[[Sequence[Record]], list[Cell]], columns: int) -> list[Line]:

@@ -70,12 +70,13 @@ def present(outcome: Outcome, plan: Experiment, folder: Path, printed: Collectio
     console = terminal.console()
     print_logs(Records(row for row in made if row["log"] not in printed) if printed else made, console)
     differences = paired(every, plan.comparisons(), plan.compare)
-    print_differences([row for row in differences if (row["log"], row["label"]) in shown], console)
     honest, converged = honesty(every), convergence(every)
-    honest_shown, converged_shown = (
-        [row for row in found if (row["log"], row["label"]) in shown] for found in (honest, converged)
-    )
-    print_over_logs(honest_shown, converged_shown, console)
+
+    def of_shown(found: list[Record]) -> list[Record]:
+        return [row for row in found if (row["log"], row["label"]) in shown]
+
+    print_differences(of_shown(differences), console)
+    print_over_logs(of_shown(honest), of_shown(converged), console)
     print_remarks(made, console)
     with writing(folder, "; the runs are in runs.sqlite"):
         write_table(every, folder / "table.csv")

@@ -26,6 +26,7 @@ from .cells import (
     cell,
     column,
     interval,
+    judged,
     lag,
     output_and_lag,
     percent,
@@ -214,10 +215,7 @@ def consistency(summary: Sequence[Record]) -> Sheet | None:
 
     def anees(row: Record, block: str) -> Cell:
         value, above, below = (row[f"anees_{block}{part}"] for part in ("", "_above", "_below"))
-        if value is None:
-            return absent(f"anees_{block}", row)
-        mark = (f"▲{above}" if above else "") + (f"▼{below}" if below else "")
-        return Cell(text(value), value, mark=mark)
+        return absent(f"anees_{block}", row) if value is None else judged(value, above, below)
 
     def within(row: Record) -> Cell:
         shares = [row[f"within_{k}sigma_position"] for k in (1, 2, 3)]

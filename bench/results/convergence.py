@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Sequence
 from statistics import fmean, median
 
-from scipy.stats import binomtest
+import scipy  # its stats load when they are first asked for
 
 from ..metrics.consistency import anees_of
 from ..metrics.pose_error import pooled_rmse
 from ..metrics.state_error import Block
-from .summary import Record, Rows, groups, has_score, records
+from .summary import Record, Rows, has_score, last_words, outputs, scores_of
 
 JUDGED: tuple[Block, ...] = ("attitude", "all")
 """The blocks whose ANEES is given: what started wrong, and everything."""
@@ -26,29 +24,26 @@ def convergence(rows: Rows) -> list[Record]:
     """Return one record per log, estimator and output whose runs were scored by `converged_deg`, as in CONVERGENCE.
 
     `share` is of all runs, with its 95 % interval by Wilson from `low` to `high`: one that fails does not converge.
-    Time (median), ATE (pooled over runs) and ANEES (mean over times and runs) are of the runs that converge. What a
-    smoother over the whole log says during the log is left out: it is a filter's, or a first guess.
+    Time (median), ATE (pooled over runs) and ANEES (mean over times and runs) are of the runs that converge. Only
+    `last_words` are given.
     """
     found = []
-    for (log, label), of_label in groups(records(rows), "log", "label").items():
-        limit_deg = json.loads(of_label[-1]["spec"] or "{}").get("scores", {}).get("converged_deg")
-        if limit_deg is None:
-            continue
-        whole = any(row["lookahead_s"] == math.inf for row in of_label)
-        runs = len(groups(of_label, "seed"))
-        for (output,), of in groups(of_label, "output").items():
-            ahead = next((row["lookahead_s"] for row in of if row["lookahead_s"] is not None), None)
-            if whole and ahead != math.inf:
-                continue
-            record = {"log": log, "label": label, "output": output, "lookahead_s": ahead, "limit_deg": limit_deg}
-            found.append(record | {"runs": runs} | _of_converged(of, runs))
-    return found
+    for output, of in outputs(rows):
+        limit_deg = scores_of(of).get("converged_deg")
+        if limit_deg is not None:
+            found.append(output | {"limit_deg": limit_deg} | _of_converged(of, output["runs"]))
+    return last_words(found)
+
+
+def limits(found: Sequence[Record]) -> str:
+    """Return below which errors runs have converged, in words: "3°"."""
+    return ", ".join(f"{limit:g}°" for limit in sorted({row["limit_deg"] for row in found}))
 
 
 def _of_converged(rows: Sequence[Record], runs: int) -> Record:
     """Return how many of the runs converge, and the scores of these."""
     good = [row for row in rows if row["status"] == "done" and row["converged_s"] is not None]
-    interval = binomtest(len(good), runs).proportion_ci(method="wilson")
+    interval = scipy.stats.binomtest(len(good), runs).proportion_ci(method="wilson")
     averages = anees_of([row["nees_at"] for row in good])
     scored = [row for row in good if has_score(row, "ate_rmse_m")]
     each, weights = ([row[name] for row in scored] for name in ("ate_rmse_m", "n_scored"))

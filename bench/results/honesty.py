@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..metrics.consistency import Average, anees_of, interval
 from ..metrics.state_error import BLOCKS, Block
-from .summary import SEEDS_ENOUGH, Record, Rows, groups, records
+from .summary import SEEDS_ENOUGH, Record, Rows, last_words, outputs
 
 FALSE_ALARM = 0.01
 """Probability that a consistent estimator leaves the band of a block at any of the fixed times: 99 % stay inside."""
@@ -32,17 +31,12 @@ def honesty(rows: Rows) -> list[Record]:
 
     A band holds for one number of seeds; where it differs between times, `low` and `high` are the widest.
     """
-    found = []
-    every = groups(records(rows), "log", "label")
-    for (log, label), of_label in every.items():
-        runs = len(groups(of_label, "seed"))
-        for (output,), of in groups(of_label, "output").items():
-            done = [row for row in of if row["status"] == "done"]
-            ahead = next((row["lookahead_s"] for row in of if row["lookahead_s"] is not None), None)
-            averages = anees_of([row["nees_at"] for row in done])
-            for block in BLOCKS:
-                record = {"log": log, "label": label, "output": output, "lookahead_s": ahead, "block": block}
-                found.append(record | _judged(averages.get(block)) | {"seeds": len(done), "runs": runs})
+    found: list[Record] = []
+    for output, of in outputs(rows):
+        done = [row for row in of if row["status"] == "done"]
+        averages = anees_of([row["nees_at"] for row in done])
+        known = output | {"seeds": len(done)}
+        found += [known | {"block": block} | _judged(averages.get(block)) for block in BLOCKS]
     return found
 
 
@@ -62,19 +56,11 @@ def _judged(average: Average | None) -> Record:
 
 
 def compared(found: Sequence[Record]) -> list[Record]:
-    """Return the records that a table or a figure of several logs shows; none where seeds or logs are too few.
-
-    What a smoother over the whole log says during the log is left out: it is a filter's, or a first guess.
-    """
+    """Return the `last_words` that a table or a figure of several logs shows; none where seeds or logs are too few."""
     logs = {row["log"] for row in found if row["anees"] is not None and row["seeds"] >= SEEDS_ENOUGH}
     if len(logs) < FEWEST_LOGS:
         return []
-    whole = {(row["log"], row["label"]) for row in found if row["lookahead_s"] == math.inf}
-    return [
-        row
-        for row in found
-        if row["log"] in logs and ((row["log"], row["label"]) not in whole or row["lookahead_s"] == math.inf)
-    ]
+    return last_words([row for row in found if row["log"] in logs])
 
 
 def band_of(found: Sequence[Record], block: Block) -> tuple[float, float] | None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import count
 from statistics import fmean, median
@@ -72,6 +73,28 @@ def groups(rows: Iterable[Record], *keys: str) -> dict[tuple[Any, ...], list[Rec
     return found
 
 
+def outputs(rows: Rows) -> Iterator[tuple[Record, list[Record]]]:
+    """Yield log, label, output and look-ahead of each output and how many runs there are, with the output's rows.
+
+    Those of one log and label follow each other. A run that failed may lack an output; it is one of the runs all the
+    same.
+    """
+    for (log, label), of_label in groups(records(rows), "log", "label").items():
+        runs = len(groups(of_label, "seed"))
+        for (output,), of in groups(of_label, "output").items():
+            ahead = next((row["lookahead_s"] for row in of if row["lookahead_s"] is not None), None)
+            yield {"log": log, "label": label, "output": output, "lookahead_s": ahead, "runs": runs}, of
+
+
+def last_words(found: Sequence[Record]) -> list[Record]:
+    """Return the records without what a smoother over the whole log says during the log.
+
+    That is a filter's estimate, or a first guess.
+    """
+    whole = {(row["log"], row["label"]) for row in found if row["lookahead_s"] == math.inf}
+    return [row for row in found if (row["log"], row["label"]) not in whole or row["lookahead_s"] == math.inf]
+
+
 def file_names(names: Iterable[str]) -> dict[str, str]:
     """Return for each name one that files and LaTeX labels can have; no two differ only in capitals."""
     found: dict[str, str] = {}
@@ -135,8 +158,13 @@ def ended_at_gap(row: Record) -> bool:
 
 def _stated(group: Sequence[Record]) -> Record:
     """Return what the experiment states of RPE and outputs, from a group's spec; None where that is not known."""
-    scores = json.loads(group[-1]["spec"] or "{}").get("scores", {})
+    scores = scores_of(group)
     return {name: scores.get(name) for name in ("rpe_delta", "rpe_unit", "rpe_pairs", "output_rate_hz")}
+
+
+def scores_of(group: Sequence[Record]) -> dict[str, Any]:
+    """Return how the rows of a group are scored (see `Scoring`), by the spec of the last; empty where it has none."""
+    return json.loads(group[-1]["spec"] or "{}").get("scores", {})
 
 
 def _missing(done: Sequence[Record]) -> dict[str, str]:

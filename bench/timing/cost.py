@@ -122,8 +122,8 @@ def _conditions(rows: pd.DataFrame, costs: Sequence[Record]) -> str:
     return (
         f"{machines}; one thread, one run at a time. Median of {max(r['runs'] for r in costs)} seeds of {logs}; "
         "compiled before. Steps and `finish`, all divided by IMU samples, or by keyframes; what is not by lag is at "
-        f"{LAGS_S[0]:g} s. With beliefs: every estimator is "
-        "charged for as many. Memory is what the run adds to the process at its peak."
+        f"{LAGS_S[0]:g} s. With beliefs: every estimator is charged for as many. Memory is what the run adds to the "
+        "process at its peak."
     )
 
 

@@ -14,6 +14,7 @@ from ...drawing import (
     TITLE_PT,
     WIDTH_IN,
     Look,
+    band_handle,
     empty_figure,
     legend_below,
     logarithmic,
@@ -82,8 +83,8 @@ def draw_nees(rows: Sequence[Record], looks: dict[str, Look], title: str) -> Fig
     if any(output == SMOOTHED for (_, output), of_line in lines.items() if of_line):
         dotted = {"marker": "o", "markersize": 3.5, "markerfacecolor": "white", "linestyle": ":", "linewidth": 0.8}
         handles.append(Line2D([], [], color="black", label=SMOOTHED, **dotted))
-    handles.append(Line2D([], [], color="black", alpha=0.25, linewidth=6, label="95 % of consistent points"))
-    handles.append(Line2D([], [], color="black", alpha=0.1, linewidth=6, label="99.9 % of consistent lines"))
+    handles.append(band_handle("95 % of consistent points", 0.25))
+    handles.append(band_handle("99.9 % of consistent lines", 0.1))
     panels[5].axis("off")
     if len(handles) <= FITS_A_PANEL and max(len(str(handle.get_label())) for handle in handles) < WIDEST_IN_A_PANEL:
         panels[5].legend(handles=handles, loc="center", frameon=False, fontsize=TEXT_PT)

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...drawing import WIDTH_IN, Look, empty_figure, legend_below, logarithmic, look_handle, narrow, plain, title_above
+from ...results.convergence import limits
 from ...results.summary import Record, groups
 from ..cells import NEES_OVER_DOF, ONLINE
 
@@ -54,9 +55,8 @@ def draw_convergence(rows: Sequence[Record], looks: dict[str, Look]) -> Figure:
             range(len(logs)), [narrow(log.removeprefix(common).strip(), 12) for log in logs], fontsize=TICK_PT
         )
         axes.set_xlabel(plain(common))
-    limits = ", ".join(f"{limit:g}°" for limit in sorted({row["limit_deg"] for row in rows}))
     runs = max(row["runs"] for row in rows)
-    title_above(figure, f"runs whose attitude error stays below {limits}, of {runs} seeds")
+    title_above(figure, f"runs whose attitude error stays below {limits(rows)}, of {runs} seeds")
     legend_below(figure, [look_handle(label, looks[label]) for label in labels])
     return figure
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from ...drawing import (
     TITLE_PT,
     WIDTH_IN,
     Look,
+    band_handle,
     empty_figure,
     handle,
     legend_below,
@@ -27,6 +27,8 @@ LEAST, MOST = 0.3, 30.0
 """Ends of the axis: the band of fifty seeds reaches from 0.7 to 1.4, and beyond 30 it does not matter how far."""
 LINE_IN = 0.055
 """Height of one output's line: a marker and a gap."""
+BAND_ALPHA = 0.12
+"""Pale, as markers stand on it."""
 LETTERS = 22
 """Of a log's name in one line, beside the first panel."""
 
@@ -47,7 +49,7 @@ def draw_honesty(rows: Sequence[Record], looks: dict[str, Look]) -> Figure:
     for block, axes in zip(BLOCKS, panels, strict=True):
         band = band_of(rows, block)
         if band is not None:
-            axes.axvspan(*band, color="black", alpha=0.12, linewidth=0)
+            axes.axvspan(*band, color="black", alpha=BAND_ALPHA, linewidth=0)
         axes.axvline(1.0, color="black", linewidth=0.4)
         axes.set(xscale="log", xlim=(LEAST, MOST), ylim=(lines, -1))
         axes.set_xticks([0.5, 1, 2, 5, 10, 20], ["0.5", "1", "2", "5", "10", "20"])
@@ -56,18 +58,15 @@ def draw_honesty(rows: Sequence[Record], looks: dict[str, Look]) -> Figure:
         axes.grid(visible=False, axis="y")
         _draw(axes, by_log, block, looks)
     panels[len(BLOCKS) // 2].set_xlabel(NEES_OVER_DOF)
-    title_above(figure, f"ANEES: mean over {max(row['times'] or 0 for row in rows)} fixed times, {_seeds(rows)} seeds")
+    times, seeds = (max(row[name] or 0 for row in rows) for name in ("times", "seeds"))
+    title_above(figure, f"ANEES: mean over {times} fixed times, {seeds} seeds")
     labels = dict.fromkeys(row["label"] for row in rows)
     handles = [handle(label, looks[label].marker, looks[label].colour, filled=True) for label in labels]
     handles.append(handle(SMOOTHED, "o", "black", filled=False))
-    handles.append(Line2D([], [], color="black", alpha=0.12, linewidth=6, label="99 % band"))
+    handles.append(band_handle("99 % band", BAND_ALPHA))
     handles.append(handle("no run finished", "x", "black", filled=True))
     legend_below(figure, handles)
     return figure
-
-
-def _seeds(rows: Sequence[Record]) -> int:
-    return max(row["seeds"] for row in rows)
 
 
 def _draw(axes: Axes, by_log: dict[str, list[list[Record]]], block: str, looks: dict[str, Look]) -> None:

@@ -17,6 +17,7 @@ from ...drawing import (
     TITLE_PT,
     WIDTH_IN,
     Look,
+    band_handle,
     empty_figure,
     legend_below,
     look_handle,
@@ -108,7 +109,7 @@ def draw_errors(tracks: Sequence[Track], looks: dict[str, Look], title: str) -> 
     smoothed = [track for track in tracks if track.output == SMOOTHED]
     handles = [Line2D([], [], color="black", linewidth=1.0, label=ONLINE)]
     if any(has_bounds(track) for track in tracks if track.output == ONLINE):
-        handles.append(Line2D([], [], color="black", alpha=0.2, linewidth=6, label=f"±3σ, {ONLINE}"))
+        handles.append(band_handle(f"±3σ, {ONLINE}", 0.2))
     if smoothed:
         handles.append(Line2D([], [], **SMOOTHED_LINE, label=SMOOTHED))
     if any(has_bounds(track) for track in smoothed):
