@@ -172,10 +172,10 @@ def _imu_table(
 
     In a gap the sample before is held, up to one period before the next one, so that no row uses a later sample.
     """
-    middle = log.imu.t_ns - (interval - gap) // 2
-    alpha_I = np.zeros_like(log.imu.w_WI_I)
-    alpha_I[1:] = np.diff(log.imu.w_WI_I, axis=0) / (np.diff(middle) * 1e-9)[:, None]
     imu, is_gap = log.imu, gap > 0
+    middle = imu.t_ns - (interval - gap) // 2
+    alpha_I = np.zeros_like(imu.w_WI_I)
+    alpha_I[1:] = np.diff(imu.w_WI_I, axis=0) / (np.diff(middle) * 1e-9)[:, None]
     held_until = imu.t_ns - interval + gap
     edges = np.union1d(times, held_until[is_gap])
     edges = edges[(edges > start_ns) & (edges <= end_ns)]

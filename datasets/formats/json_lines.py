@@ -14,10 +14,18 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError
 from .recording import TopicInfo, not_found
-from .topics import NS, Channel, MalformedMessage, Message, ScanResult, ShortArray, TopicRecording
+from .topics import (
+    MOST_FIELDS,
+    MOST_LEVELS,
+    NS,
+    Channel,
+    MalformedMessage,
+    Message,
+    ScanResult,
+    ShortArray,
+    TopicRecording,
+)
 
-MOST_FIELDS, MOST_LEVELS = 10_000, 50
-"""Of an object that are listed, and how deep in one another, as for ROS."""
 LONGEST_LINE = 1 << 20
 """Bytes of an object: a report of a DVL has a thousand, and Python needs some 50 times as many for what is in it."""
 NO_KIND = "object"
@@ -126,12 +134,7 @@ class JsonExtractor:
         """
         for column in self._wanted:
             if column not in self._met:
-                raise not_found(
-                    self._where,
-                    "numeric field called",
-                    column,
-                    json_fields(self._shape or {}),
-                )
+                raise not_found(self._where, "numeric field called", column, json_fields(self._shape or {}))
         return dict(zip(self._wanted, raw, strict=True))
 
     def _value(self, message: Any, column: str, path: Sequence[str]) -> int | float:

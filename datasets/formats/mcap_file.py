@@ -21,7 +21,17 @@ from ..errors import DatasetError, one_line
 from .json_lines import JsonExtractor
 from .recording import extra, not_found
 from .ros_messages import Definitions, Types, definitions_of, ros_channel, short_name
-from .topics import NS, Channel, MalformedMessage, Message, ScanResult, ShortArray, TopicRecording
+from .topics import (
+    MOST_FIELDS,
+    MOST_LEVELS,
+    NS,
+    Channel,
+    MalformedMessage,
+    Message,
+    ScanResult,
+    ShortArray,
+    TopicRecording,
+)
 from .unpacking import Unpacking
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -34,8 +44,6 @@ _CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 MOST_TYPES = 10_000
 """Types in a schema of Protocol Buffers; each makes a class of Python of some 3 kB."""
-MOST_FIELDS, MOST_LEVELS = 10_000, 50
-"""Of a type of Protocol Buffers or an object of JSON that are listed, and how deep in one another, as for ROS."""
 _TIMES = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
 

@@ -17,17 +17,13 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError, one_line
 from .recording import extra, not_found
-from .topics import NS, Channel, MalformedMessage, ShortArray
+from .topics import MOST_FIELDS, MOST_LEVELS, NS, Channel, MalformedMessage, ShortArray
 
 CODES = {"bool": "B", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
          "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d"}  # fmt: skip
 TIMES = {"time", "duration", "builtin_interfaces/Time", "builtin_interfaces/Duration"}
 """Seconds and nanoseconds, read as one number of nanoseconds."""
 STRINGS = {"string", "wstring"}
-MOST_FIELDS = 10_000
-"""Of one type with all that it contains; large ones have some hundred. Few lines can contain one another often."""
-MOST_LEVELS = 50
-"""Types in one another; the deepest of ROS has 6."""
 LONGEST_PATH = 1000
 """Characters of a field's path."""
 MOST_DEFINITION = 1 << 20

@@ -27,6 +27,9 @@ MOST_CHANNELS = 10_000
 """In a recording; a busy vehicle has some hundred topics."""
 MOST_DEFINITIONS = 64 << 20
 """Bytes of all definitions of messages in a recording: 64 MiB; that of one type has some 10 kB."""
+MOST_FIELDS, MOST_LEVELS = 10_000, 50
+"""Of one type, or object of JSON, with all that it contains, and types in one another; large ones have some hundred
+fields, and the deepest of ROS has 6 levels. Few lines can contain one another often."""
 MOST_FIELDS_LISTED = 100_000
 """In the contents of a recording; a message has some 50."""
 LEAST_COST = 100

@@ -35,11 +35,7 @@ def _mountings(scenario: Scenario) -> list[str]:
 
 
 def _sensors(scenario: Scenario) -> list[str]:
-    specs = {sensor: getattr(scenario, sensor) for sensor in SENSORS}
-    dials = {
-        s: {n: v for n, v in changed(spec).items() if n in UNSEEN} for s, spec in specs.items() if spec is not None
-    }
-    return [f"{sensor}: {listed(values)}." for sensor, values in dials.items() if values]
+    return [note for sensor in SENSORS for note in _unseen(scenario, sensor)]
 
 
 def _late(scenario: Scenario) -> list[str]:
@@ -63,14 +59,18 @@ def _faults(scenario: Scenario) -> list[str]:
 
 
 def _told(scenario: Scenario) -> list[str]:
-    parts = {name: getattr(scenario, name) for name in ("imu", *SENSORS, "prior")}
-    told = {name: changed(part.told) for name, part in parts.items() if part is not None}
+    told = {name: changed(part.told) for name, part in scenario.noisy.items()}
     return [f"{name} is told otherwise than simulated: {listed(dials)}." for name, dials in told.items() if dials]
 
 
 def _prior(scenario: Scenario) -> list[str]:
-    dials = {name: value for name, value in changed(scenario.prior).items() if name in UNSEEN}
-    return [f"prior: {listed(dials)}."] if dials else []
+    return _unseen(scenario, "prior")
+
+
+def _unseen(scenario: Scenario, name: str) -> list[str]:
+    spec = getattr(scenario, name)
+    dials = {} if spec is None else {name: value for name, value in changed(spec).items() if name in UNSEEN}
+    return [f"{name}: {listed(dials)}."] if dials else []
 
 
 def changed(spec: Any) -> dict[str, Any]:

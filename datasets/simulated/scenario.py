@@ -54,10 +54,7 @@ CALLED_NOW = {
     **{f"gyro_{dial}_dps": f"gyro_{dial}_deg_s" for dial in ("outlier", "limit", "quantum")},
     **{f"imu_{name}": f"imu.{name}" for name in ("rate_hz", "faults")},
     "imu_bias_correlation_s": "imu.faults.bias_correlation_s",
-    **{
-        f"{name}": f"faults.{name}"
-        for name in ("bias_correlation_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg")
-    },
+    **{n: f"faults.{n}" for n in ("bias_correlation_s", "bias_deg", "soft_iron_deg", "soft_iron_axis_deg")},
     **{f"{sensor}_mounting": f"{sensor}.mounting" for sensor in ("imu", "depth", "gps", "heading")},
     **{name: f"noise.{name}" for name in ImuNoise.__dataclass_fields__},
     "roll_pitch_yaw_deg": "roll_deg, pitch_deg and yaw_deg",
@@ -203,17 +200,16 @@ class Scenario:
         return dataclasses.asdict(self)
 
     @property
+    def noisy(self) -> dict[str, Any]:
+        """All that has noise, and says under `told` what is told of it: the IMU, the sensors aboard and the prior."""
+        parts = {name: getattr(self, name) for name in ("imu", *SENSORS, "prior")}
+        return {name: part for name, part in parts.items() if part is not None}
+
+    @property
     def truly_told(self) -> Scenario:
         """The same scenario, whose log states the noise that is simulated."""
-        parts = {name: getattr(self, name) for name in ("imu", *SENSORS, "prior")}
-        return dataclasses.replace(
-            self,
-            **{
-                name: dataclasses.replace(part, told=type(part.told)())
-                for name, part in parts.items()
-                if part is not None
-            },
-        )
+        told = {name: dataclasses.replace(part, told=type(part.told)()) for name, part in self.noisy.items()}
+        return dataclasses.replace(self, **told)
 
     @property
     def faults(self) -> dict[str, AnyFaults]:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 COMPONENTS = 16
 """Waves of equal energy: enough for a sea that does not repeat within a mission, few enough to be cheap."""
-
-
 SLOWEST_MEAN = 1.4492
 """Largest value of 2 sin²x / x, at tan x = 2x. The mean of a wave over a window τ has (sin x / x)² of its variance,
 with x = ω τ / 2, and the mean of white readings every Δt has Δt / τ. At most the wave's is larger by this over ω Δt."""
@@ -100,14 +98,18 @@ class Sea:
         mean of rise_m: docs/conventions.md (75). For a single reading it is no less than the rms of rise_m. Readings
         must come three times in a wave's period or more often, or waves look slower than they are.
         """
-        k = self.frequency_rad_s**2 / self.gravity
         repeated = np.maximum(1.0, SLOWEST_MEAN / (self.frequency_rad_s * period_s))
         variance = 0.5 * self.amplitude_m**2 * repeated
-        return np.sqrt(np.exp(np.outer(np.minimum(z_m, 0.0), 2 * k)) @ variance)
+        return np.sqrt(np.exp(np.outer(np.minimum(z_m, 0.0), 2 * self._wavenumber)) @ variance)
+
+    @property
+    def _wavenumber(self) -> Array:
+        """(m,) rad/m, in deep water."""
+        return self.frequency_rad_s**2 / self.gravity
 
     def _waves(self, t_s: Array, p_W: Array) -> tuple[Array, Array, Array]:
         """Return a e^kz and k · x − ω t + φ, (n, m), and k (m,)."""
-        k = self.frequency_rad_s**2 / self.gravity
+        k = self._wavenumber
         depth = np.minimum(p_W[:, 2] - self.tide_m(t_s), 0.0)
         phase = np.outer(p_W[:, :2] @ self.direction, k) - np.outer(t_s, self.frequency_rad_s) + self.phase_rad
         return self.amplitude_m * np.exp(np.outer(depth, k)), phase, k

@@ -50,7 +50,7 @@ def in_the_air_m(log: Log) -> float:
     if log.depth is None or len(log.depth) < FEWEST:
         return 0.0
     highest = float(np.partition(log.depth.z[:, 0], -FEWEST)[-FEWEST])
-    return highest if highest > ZERO_M + _noise_m(log.depth) else 0.0
+    return highest if highest > ZERO_M + noise_m(log.depth) else 0.0
 
 
 def surface_findings(sketch: Sketch) -> list[Finding]:
@@ -62,7 +62,7 @@ def surface_findings(sketch: Sketch) -> list[Finding]:
     log, at = sketch.log, _at_fixes(sketch)
     if log.depth is None or at is None:
         return []
-    noise = _noise_m(log.depth)
+    noise = noise_m(log.depth)
     line = at.z + np.clip(at.above, 0.0, MAST_M) / 2
     least, zero, most = _quantiles(line)
     highest = float(log.depth.z.max()) - float(np.median(at.z))
@@ -120,7 +120,7 @@ def zero_finding(log: Log, off_m: float) -> Finding:
     assert log.depth is not None
     assert log.truth is not None
     z, height, whose = log.depth.z[:, 0], log.truth.p_WB_W[:, 2], log.truth_kind
-    noise = _noise_m(log.depth)
+    noise = noise_m(log.depth)
     message = f"The {whose}'s height is {-off_m:+.2f} m (median) against the depth sensor's throughout"
     raised, moved = f"truth: raise {off_m:.3f}", DEPTH_OFFSET.format(off_m, -off_m)
     if in_the_air_m(log):
@@ -159,11 +159,11 @@ def _by_truth(sketch: Sketch) -> float | None:
         return None
     off = at.z + at.above - log.truth.p_WB_W[at.rows, 2]
     least, middle, most = _quantiles(off[np.isfinite(off)])
-    limit = ZERO_M + _noise_m(log.depth)
+    limit = ZERO_M + noise_m(log.depth)
     return middle if abs(middle) > limit and most - least < CONSTANT * abs(middle) else None
 
 
-def _noise_m(depth: DepthStream) -> float:
+def noise_m(depth: DepthStream) -> float:
     """Return what noise explains of a difference of heights, m."""
     return NOISES * float(stated_sigma(depth)[0])
 

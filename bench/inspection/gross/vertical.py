@@ -13,7 +13,7 @@ from ..findings.advice import DEPTH_OFFSET, clock_fix, late_or_early
 from ..findings.finding import Finding
 from ..findings.fitting import Mask
 from ..streams.channels import seconds
-from .datum import in_the_air_m
+from .datum import in_the_air_m, noise_m
 from .shifts import Shift, shift_of
 from .sketch import Sketch
 
@@ -130,7 +130,7 @@ def climb_scale(sketch: Sketch) -> float | None:
 
 def _in_the_air(log: Log) -> bool:
     assert log.depth is not None
-    return float(np.median(log.depth.z)) > IN_THE_AIR_M + 3 * float(np.median(log.depth.sigma))
+    return float(np.median(log.depth.z)) > IN_THE_AIR_M + noise_m(log.depth)
 
 
 def _inverse(slope: Slope) -> Slope:
