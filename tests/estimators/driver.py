@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,29 @@ def error_states(truth: Trajectory, track: Trajectory) -> np.ndarray:
 def nees(e: np.ndarray, P: np.ndarray, of: slice = slice(None)) -> np.ndarray:
     """(n,) values of eᵀ P⁻¹ e over a part of error states (n, 15) and their covariances (n, 15, 15)."""
     return np.einsum("ni,ni->n", e[:, of], np.linalg.solve(P[:, of, of], e[:, of, None])[..., 0])
+
+
+def summed_nees(
+    estimator: Estimator, logs: Iterable[Log], epochs_s: Sequence[float], parts: Mapping[str, slice] = BLOCKS
+) -> dict[str, dict[str, np.ndarray]]:
+    """NEES summed over independent logs, by output and part of the state, at these epochs, s from the start."""
+    sums: dict[str, dict[str, np.ndarray]] = {}
+    for log in logs:
+        result = run_log(log, estimator)
+        assert result.status == "done", (log.name, result.cause)
+        for output, whole in result.outputs.items():
+            track = whole.select(np.searchsorted(whole.t_ns, log.start_ns + np.multiply(epochs_s, 10**9)))
+            e, of_output = error_states(log.truth, track), sums.setdefault(output, {})
+            for part, of in parts.items():
+                of_output[part] = of_output.get(part, 0.0) + nees(e, track.P, of)
+    return sums
+
+
+def gaps_in_sigma(a: Trajectory, b: Trajectory) -> np.ndarray:
+    """(n, 15) differences of the states over the first's standard deviations."""
+    theta = np.einsum("nji,njk->nik", a.R_WB, b.R_WB)[:, [2, 0, 1], [1, 2, 0]]
+    rest = [getattr(b, name) - getattr(a, name) for name in ("p_WB_W", "v_WB_W", "b_a", "b_g")]
+    return np.abs(np.hstack([theta, *rest])) / np.sqrt(np.einsum("nii->ni", a.P))
 
 
 def rmse_m(truth: Trajectory, track: Trajectory) -> float:

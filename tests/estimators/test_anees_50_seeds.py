@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from driver import BLOCKS, error_states, run_log
+from driver import BLOCKS, summed_nees
 from fathom.datasets import Log
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
@@ -43,24 +43,12 @@ def test_anees_over_50_seeds_lies_in_its_interval(name: str, path: str) -> None:
     """Per output and part of the state, the 0.001 is shared among the epochs: errors are correlated over time."""
     known = ESTIMATORS[name].__dataclass_fields__
     estimator = create(name, **{key: value for key, value in AT_EVERY_TICK.items() if key in known})
-    errors: dict[str, list[np.ndarray]] = {}
-    covariances: dict[str, list[np.ndarray]] = {}
-    for seed in range(SEEDS):
-        log = mission(path, seed)
-        result = run_log(log, estimator)
-        assert result.status == "done", (seed, result.cause)
-        for output, track in result.outputs.items():
-            rows = np.searchsorted(track.t_ns, log.start_ns + EPOCHS_S * 10**9)
-            errors.setdefault(output, []).append(error_states(log.truth, track)[rows])
-            covariances.setdefault(output, []).append(track.P[rows])
-    assert list(errors) == (["online", "smoothed"] if name in ("rts", "fls", "batch") else ["online"])
-    for output in errors:
-        e_all, P_all = np.array(errors[output]), np.array(covariances[output])
-        assert e_all.shape == (SEEDS, len(EPOCHS_S), 15)
-        for block, of in BLOCKS.items():
-            e = e_all[:, :, of, None]
-            nees = (e * np.linalg.solve(P_all[:, :, of, of], e)).sum(axis=(0, 2, 3))
-            dof = SEEDS * e.shape[2]
+    found = summed_nees(estimator, (mission(path, seed) for seed in range(SEEDS)), EPOCHS_S)
+    assert list(found) == (["online", "smoothed"] if name in ("rts", "fls", "batch") else ["online"])
+    for output, sums in found.items():
+        for block, nees in sums.items():
+            assert nees.shape == EPOCHS_S.shape
+            dof = SEEDS * (BLOCKS[block].stop - BLOCKS[block].start)
             low, high = chi2.interval(1 - 0.001 / len(EPOCHS_S), dof)
             assert (low < nees).all(), (output, block, nees / dof, low / dof)
             assert (nees < high).all(), (output, block, nees / dof, high / dof)

@@ -13,7 +13,7 @@ from pathlib import Path as FilePath
 import gtsam
 import numpy as np
 import pytest
-from driver import BLOCKS, error_states, nees, run_log
+from driver import BLOCKS, error_states, run_log, summed_nees
 from fathom.datasets import Belief, Log, Mounting, NavState, Rig, open_log
 from fathom.datasets import rig as rig_module
 from fathom.datasets.described.folder import write_folder
@@ -369,19 +369,13 @@ def small_mission(seed: int) -> Log:
     return simulate(Scenario(duration_s=61.0, imu="navigation", latitude_deg=45.0, **SMALL, **SENSORS), seed)
 
 
-def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
+def anees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     """By part of the state: NEES summed over the seeds, at each epoch, per degree of freedom."""
     known = ESTIMATORS[name].__dataclass_fields__
     every_tick = {"smoothed_covariance_s": 1e-3} if "smoothed_covariance_s" in known else {}
-    estimator, sums = create(name, earth_rotation=knows, **every_tick), {}
-    for seed in range(SEEDS):
-        log = small_mission(seed)
-        track = run_log(log, estimator).outputs[output]
-        rows = np.searchsorted(track.t_ns, log.start_ns + EPOCHS_S * 10**9)
-        for part, of in BLOCKS.items():
-            of_part = nees(error_states(log.truth, track)[rows], track.P[rows], of)
-            sums[part] = sums.get(part, 0.0) + of_part / (SEEDS * (of.stop - of.start))
-    return sums
+    estimator = create(name, earth_rotation=knows, **every_tick)
+    sums = summed_nees(estimator, map(small_mission, range(SEEDS)), EPOCHS_S)[output]
+    return {part: total / (SEEDS * (BLOCKS[part].stop - BLOCKS[part].start)) for part, total in sums.items()}
 
 
 @pytest.mark.slow
@@ -396,12 +390,12 @@ def summed_nees(name: str, output: str, knows: bool) -> dict[str, np.ndarray]:
     ],
 )
 def test_a_navigation_grade_imu_is_consistent_only_with_earth_rotation(name: str, output: str) -> None:
-    for part, found in summed_nees(name, output, knows=True).items():
+    for part, found in anees(name, output, knows=True).items():
         dof = SEEDS * len(np.arange(15)[BLOCKS[part]])
         low, high = np.array(chi2.interval(1 - 0.001 / len(EPOCHS_S), dof)) / dof
         assert (low < found).all(), (part, found, low)
         assert (found < high).all(), (part, found, high)
-    astray = summed_nees(name, output, knows=False)["attitude"]
+    astray = anees(name, output, knows=False)["attitude"]
     assert astray.min() > 2
     assert astray.max() > 1000
 

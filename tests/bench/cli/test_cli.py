@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -47,13 +48,28 @@ def circle(errors_m: float = 0.0) -> Trajectory:
     return Trajectory(np.arange(200) * 10**9, np.repeat(np.eye(3)[None], 200, axis=0), p + np.array([errors_m, 0, 0]))
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[int, str, str]]:
+    """Where the short experiment has been run, and what the command said of it."""
+    out = tmp_path_factory.mktemp("finished")
+    return out, call("run", write(out), "--out", out, "--jobs", 2)
+
+
+@pytest.fixture
+def again(finished: tuple[Path, tuple[int, str, str]], tmp_path: Path) -> Path:
+    """A copy of it, to run again."""
+    out, (code, _, _) = finished
+    assert code == 0
+    return shutil.copytree(out, tmp_path / "again")
+
+
 @pytest.mark.slow
-def test_run_writes_store_table_and_figures_and_prints_the_table(tmp_path: Path) -> None:
-    code, out, _ = call("run", write(tmp_path), "--out", tmp_path / "r", "--jobs", 2)
+def test_run_writes_store_table_and_figures_and_prints_the_table(finished: tuple[Path, tuple[int, str, str]]) -> None:
+    place, (code, out, _) = finished
     assert code == 0
     assert "eskf" in out
     assert "alignment: none" in out
-    folder = tmp_path / "r" / "short"
+    folder = place / "short"
     assert pd.read_csv(folder / "table.csv")["done"].tolist() == [1, 1]
     assert r"\toprule" in (folder / "table.tex").read_text()
     assert pd.read_csv(folder / "consistency.csv")["seeds"].unique().tolist() == [1]
@@ -97,23 +113,20 @@ def test_results_of_a_recording_that_is_gone_are_kept_and_nothing_run_is_exit_2(
 
 
 @pytest.mark.slow
-def test_only_after_a_change_leaves_what_is_outdated_out_of_the_csv(tmp_path: Path) -> None:
-    assert call("run", write(tmp_path), "--out", tmp_path, "--jobs", 2)[0] == 0
-    changed = write(tmp_path, scores="{rpe_delta: 5.0}")
-    code, _, err = call("run", changed, "--out", tmp_path, "--jobs", 1, "--only", "dead-reckoning")
+def test_only_after_a_change_leaves_what_is_outdated_out_of_the_csv(again: Path) -> None:
+    changed = write(again, scores="{rpe_delta: 5.0}")
+    code, _, err = call("run", changed, "--out", again, "--jobs", 1, "--only", "dead-reckoning")
     assert code == 0
-    assert pd.read_csv(tmp_path / "short" / "table.csv")["label"].tolist() == ["dead-reckoning"]
+    assert pd.read_csv(again / "short" / "table.csv")["label"].tolist() == ["dead-reckoning"]
     assert "1 rows of another spec or version are left out" in err
 
 
 @pytest.mark.slow
-def test_only_leaves_the_others_in_the_csv(tmp_path: Path) -> None:
-    file = write(tmp_path)
-    assert call("run", file, "--out", tmp_path, "--jobs", 2)[0] == 0
-    code, out, _ = call("run", file, "--out", tmp_path, "--jobs", 1, "--only", "eskf")
+def test_only_leaves_the_others_in_the_csv(again: Path) -> None:
+    code, out, _ = call("run", write(again), "--out", again, "--jobs", 1, "--only", "eskf")
     assert code == 0
     assert "dead-reckoning" not in out
-    assert pd.read_csv(tmp_path / "short" / "table.csv")["label"].tolist() == ["dead-reckoning", "eskf"]
+    assert pd.read_csv(again / "short" / "table.csv")["label"].tolist() == ["dead-reckoning", "eskf"]
 
 
 @pytest.mark.parametrize(

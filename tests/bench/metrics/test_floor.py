@@ -183,9 +183,9 @@ def test_what_has_no_variance_or_no_noise_is_no_special_case() -> None:
     ],
     ids=["lawnmower", "between-samples", "delayed"],
 )
-def test_without_noise_eskf_claims_the_floor_and_rts_that_of_the_whole_log(scenario: Scenario) -> None:
+def test_without_noise_iekf_claims_the_floor_and_rts_that_of_the_whole_log(scenario: Scenario) -> None:
     log = twin(scenario, 2)
-    result = run_log(log, create("rts"))  # its online beliefs are eskf's
+    result = run_log(log, create("rts"))  # its online beliefs are iekf's
     found = floors(scenario, 2, result.online.t_ns)
     assert np.array_equal(found[0.0].t_ns, result.online.t_ns)
     assert apart(found[0.0].P, result.online.P) < 5e-3
@@ -304,15 +304,15 @@ def test_ticks_outside_the_log_are_passed_over_and_without_any_there_is_nothing(
 
 
 @pytest.mark.slow
-def test_eskf_and_rts_reach_the_floor_and_do_not_beat_it() -> None:
+def test_iekf_and_rts_reach_the_floor_and_do_not_beat_it() -> None:
     """200 tactical minutes: the 99.9 % interval of each ratio reaches 1, that of 99 % meets [1, 1.1]."""
     scenario, blocks = Scenario(duration_s=60.0), {"position": POSITION, "velocity": VELOCITY, "attitude": THETA}
     of_seeds: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for seed in range(200):
         log = simulate(scenario, seed)
-        result = run_log(log, create("rts"))  # its online beliefs are eskf's
+        result = run_log(log, create("rts"))  # its online beliefs are iekf's
         found = floors(scenario, seed, score_ticks(log, 1.0))
-        for name, track in (("eskf", result.online), ("rts", result.smoothed)):
+        for name, track in (("iekf", result.online), ("rts", result.smoothed)):
             for block, part in blocks.items():
                 pair = squares(log.truth, track, found[track.lookahead_s], part)
                 of_seeds.setdefault((name, block), []).append(pair)

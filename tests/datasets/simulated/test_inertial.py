@@ -15,14 +15,7 @@ from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import MISSIONS, ImuSpec, TideSpec, WavesSpec
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
-
-
-def assert_variance(samples: np.ndarray, sigma: float) -> None:
-    """Zero-mean samples have this sigma, at 99.9 %."""
-    low, high = chi2.interval(0.999, samples.size)
-    assert low < np.sum((samples / sigma) ** 2) < high
-
+from variances import assert_variance
 
 # -- what the IMU reports
 

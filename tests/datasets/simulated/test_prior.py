@@ -12,13 +12,7 @@ from fathom.datasets.state import Belief, NavState
 from fathom.datasets.trajectory import Trajectory
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-
-
-def assert_variance(samples: np.ndarray, sigma: float) -> None:
-    """Zero-mean samples have this sigma, at 99.9 %."""
-    low, high = chi2.interval(0.999, samples.size)
-    assert low < np.sum((samples / sigma) ** 2) < high
-
+from variances import assert_variance
 
 UNKNOWN_HEADING = PriorSpec(attitude_deg=1, heading_deg=40, velocity_in="B")
 

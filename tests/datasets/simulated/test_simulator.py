@@ -33,6 +33,7 @@ from fathom.datasets.simulated.specs import (
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest, pearsonr, uniform
+from variances import assert_variance
 
 SENSORS = ("dvl", "depth", "gps", "heading")
 
@@ -52,12 +53,6 @@ def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
     assert a.keys() == b.keys()
     for name, value in a.items():
         assert np.array_equal(value, b[name]), name
-
-
-def assert_variance(samples: np.ndarray, sigma: float) -> None:
-    """Zero-mean samples have this sigma, at 99.9 %."""
-    low, high = chi2.interval(0.999, samples.size)
-    assert low < np.sum((samples / sigma) ** 2) < high
 
 
 def truth_at(log: Log, t_ns: np.ndarray) -> np.ndarray:

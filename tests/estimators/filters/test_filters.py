@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from driver import FILTERS, error_states, heading_error_rad, matched, nees, run_log
+from driver import BLOCKS, FILTERS, heading_error_rad, matched, run_log, summed_nees
 from fathom.datasets import Belief, Log, NavState
 from fathom.datasets.epochs import DVL, GPS, IMU_SAMPLE, Epoch
 from fathom.datasets.simulated.scenario import Scenario
@@ -266,20 +265,6 @@ def test_invariant_filter_finds_a_heading_that_is_60_degrees_off(known: str, mon
     assert max(error_deg["iekf"]) < 0.5 * min(error_deg["eskf"])
 
 
-def anees(name: str, logs: Sequence[Log], epochs_s: Sequence[int], **options: object) -> dict[str, np.ndarray]:
-    """Summed NEES of attitude, position and velocity at these epochs over independent logs, by output."""
-    total: dict[str, np.ndarray] = {}
-    for log in logs:
-        result = run_log(log, create(name, **options))
-        assert result.status == "done", result.cause
-        for output, track in result.outputs.items():
-            rows = np.searchsorted(track.t_ns, log.start_ns + np.array(epochs_s) * 10**9)
-            e, P = error_states(log.truth, track)[rows], track.P[rows]
-            found = [nees(e, P, slice(k, k + 3)) for k in (0, 3, 6)]
-            total[output] = total.get(output, 0.0) + np.array(found)
-    return total
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["unknown heading", "no DVL, then a fix"])
 def test_the_invariant_filter_and_its_smoother_do_not_claim_what_they_cannot_know(regime: str) -> None:
@@ -295,9 +280,11 @@ def test_the_invariant_filter_and_its_smoother_do_not_claim_what_they_cannot_kno
         dive = Scenario(duration_s=240, imu="tactical", surface_every_s=110, leg_m=40, dvl=None)
         logs = [simulate(dive, seed) for seed in range(10)]
     low, high = chi2.interval(1 - 0.001 / (2 * 3 * len(epochs_s)), 3 * len(logs))
-    for output, total in anees("rts", logs, epochs_s, **options).items():  # online it is iekf
-        assert (total > low).all(), (output, total / (3 * len(logs)))
-        assert (total < high).all(), (output, total / (3 * len(logs)))
+    parts = {part: BLOCKS[part] for part in ("attitude", "position", "velocity")}
+    for output, sums in summed_nees(create("rts", **options), logs, epochs_s, parts).items():  # online it is iekf
+        for part, total in sums.items():
+            assert (total > low).all(), (output, part, total / (3 * len(logs)))
+            assert (total < high).all(), (output, part, total / (3 * len(logs)))
 
 
 # -- remedies of the field --------------------------------------------------------------------------------------------

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from driver import run_log
-from fathom.datasets import Trajectory
+from driver import gaps_in_sigma, run_log
 from fathom.datasets.epochs import cut
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
@@ -19,13 +18,6 @@ from fathom.estimators.graph.solvers import BatchSolver
 TACTICAL = Scenario(duration_s=60.0, imu="tactical")
 EVERY_STEP_ANEW = {"relinearize": (0.0, 0.0, 0.0, 0.0), "wildfire": 0.0}
 ON_GTSAM = ["fls", "fls-batch", "isam2", "batch"]
-
-
-def gaps_in_sigma(a: Trajectory, b: Trajectory) -> np.ndarray:
-    """(n, 15) differences of the states over the first's standard deviations."""
-    theta = np.einsum("nji,njk->nik", a.R_WB, b.R_WB)[:, [2, 0, 1], [1, 2, 0]]
-    rest = [getattr(b, name) - getattr(a, name) for name in ("p_WB_W", "v_WB_W", "b_a", "b_g")]
-    return np.abs(np.hstack([theta, *rest])) / np.sqrt(np.einsum("nii->ni", a.P))
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from driver import BLOCKS, error_states, nees, rmse_m, run_log
-from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig, Trajectory
+from driver import BLOCKS, gaps_in_sigma, rmse_m, run_log, summed_nees
+from fathom.datasets import Belief, ImuNoise, Log, NavState, Rig
 from fathom.datasets.epochs import ATTITUDE, DEPTH, DVL, GPS, HEADING, Epoch, cut
 from fathom.datasets.log import DvlStream, ImuStream
 from fathom.datasets.mounting import MountingSpec
@@ -16,6 +16,7 @@ from fathom.datasets.simulated.imu_grades import IMU_GRADES
 from fathom.datasets.simulated.scenario import Scenario
 from fathom.datasets.simulated.simulator import simulate
 from fathom.datasets.simulated.specs import DepthSpec, DvlSpec, GpsSpec, HeadingSpec, ImuSpec
+from fathom.datasets.state import POSITION
 from fathom.estimators import FACTORS, Diverged, Pass, create
 from fathom.estimators.graph.gtsam_border import (
     carried_factor,
@@ -42,18 +43,12 @@ def _drive(run: Pass, epochs: list[Epoch]) -> None:
         run.step(epoch)
 
 
-def position_gap_in_sigma(a: Trajectory, b: Trajectory, after_s: float) -> np.ndarray:
-    rows = a.t_ns - a.t_ns[0] > after_s * 1e9
-    sigma = np.sqrt(np.einsum("nii->ni", a.P)[:, 3:6])
-    return (np.abs(a.p_WB_W - b.p_WB_W) / sigma)[rows]
-
-
 @pytest.mark.parametrize("mission", ["lawnmower", pytest.param("yo-yo", marks=pytest.mark.slow)])
 def test_filter_and_smoother_agree_online(mission: str) -> None:
     """After the first minute: positions within a tenth of a sigma, every standard deviation within 2 %."""
     log = simulate(replace(TACTICAL, mission=mission), seed=4)
     eskf, fls = (run_log(log, create(name)).online for name in ("eskf", "fls"))
-    assert position_gap_in_sigma(eskf, fls, 60.0).max() < 0.1
+    assert gaps_in_sigma(eskf, fls)[61:, POSITION].max() < 0.1
     ratio = np.sqrt(np.einsum("nii->ni", fls.P) / np.einsum("nii->ni", eskf.P))
     assert np.abs(ratio[60:] - 1).max() < 0.02
 
@@ -88,7 +83,7 @@ def test_one_second_keyframes_lose_nothing() -> None:
     every, sparse = (run_log(log, create("fls", **o)) for o in ({}, {"keyframe_period_s": 1.0}))
     assert sparse.counts["keyframes"] < every.counts["keyframes"] / 4
     assert sparse.counts["carried"] > 500
-    east, north, up = position_gap_in_sigma(every.online, sparse.online, 20.0).max(axis=0)
+    east, north, up = gaps_in_sigma(every.online, sparse.online)[21:, POSITION].max(axis=0)
     assert max(east, north) < 0.02
     assert (
         up < 0.5
@@ -362,7 +357,7 @@ def test_odd_rates_and_delays_leave_filter_and_smoother_in_agreement() -> None:
     eskf, fls = (run_log(log, create(name)) for name in ("eskf", "fls"))
     assert fls.counts["late_used"] > 300
     assert eskf.counts.get("late", 0) == fls.counts.get("late", 0) == 0
-    assert position_gap_in_sigma(eskf.online, fls.online, 60.0).max() < 0.1
+    assert gaps_in_sigma(eskf.online, fls.online)[61:, POSITION].max() < 0.1
     ratio = np.sqrt(np.einsum("nii->ni", fls.online.P) / np.einsum("nii->ni", eskf.online.P))
     assert np.abs(ratio[60:] - 1).max() < 0.02
 
@@ -373,7 +368,7 @@ def test_minutes_without_any_reading_end_where_the_filter_ends() -> None:
     log = simulate(scenario, seed=2)
     eskf, fls = (run_log(log, create(name)) for name in ("eskf", "fls"))
     assert fls.counts["keyframes"] > 120
-    assert position_gap_in_sigma(eskf.online, fls.online, 60.0).max() < 0.3
+    assert gaps_in_sigma(eskf.online, fls.online)[61:, POSITION].max() < 0.3
 
 
 @pytest.mark.parametrize(
@@ -400,7 +395,7 @@ def test_a_dvl_that_measures_two_axes_is_used_for_two() -> None:
     wheels = replace(log, dvl=replace(log.dvl, sigma=sigma))
     eskf, fls = (run_log(wheels, create(name)) for name in ("eskf", "fls"))
     assert eskf.status == fls.status == "done"
-    assert position_gap_in_sigma(eskf.online, fls.online, 10.0).max() < 0.3
+    assert gaps_in_sigma(eskf.online, fls.online)[11:, POSITION].max() < 0.3
 
 
 def test_an_imu_whose_biases_do_not_walk_is_accepted() -> None:
@@ -425,12 +420,10 @@ def test_dvl_readings_out_of_order_are_summed_in_order() -> None:
 def test_preintegration_is_consistent_on_a_steep_yo_yo(mode: str, kind: str) -> None:
     """NEES of attitude and velocity over 20 seeds: what the vehicle does between readings is counted."""
     steep, n = {"depth_m": 15.0, "shallow_m": 3.0, "climb_deg": 45.0, "wobble_deg": 8.0}, 20
-    totals = dict.fromkeys(("attitude", "velocity"), 0.0)
-    for seed in range(n):
-        log = simulate(Scenario(mission="yo-yo", duration_s=50.0, imu="industrial", **steep), seed=seed)
-        online = run_log(log, create("fls", dvl=[f"preintegrated-{kind}"], dvl_between=mode)).online
-        for name in totals:
-            totals[name] += float(nees(error_states(log.truth, online), online.P, BLOCKS[name])[44])
+    scenario = Scenario(mission="yo-yo", duration_s=50.0, imu="industrial", **steep)
+    smoother = create("fls", dvl=[f"preintegrated-{kind}"], dvl_between=mode)
+    parts = {part: BLOCKS[part] for part in ("attitude", "velocity")}
+    totals = summed_nees(smoother, (simulate(scenario, seed) for seed in range(n)), (45,), parts)["online"]
     for total in totals.values():
         assert total < chi2.ppf(0.999, 3 * n), totals
         assert total > 0.5 * chi2.ppf(0.001, 3 * n), totals  # a random walk is modest of a motion that is smooth
