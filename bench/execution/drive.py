@@ -223,7 +223,8 @@ def run_log(
         cause = f"{type(estimator).__name__} changed arrays of the log, the prior or the rig, which other runs use too"
         online, smoothed, ending = None, None, Ending("failed", cause, ending.t_ns, ending.traceback)
 
-    driven = voyage.epochs[: len(recorder.step_ns)]
+    step_ns = np.array(recorder.step_ns, np.int64)
+    driven = voyage.epochs[: len(step_ns)]
     end_ns = driven[-1].t_ns if driven else voyage.start_ns
     innovations_found = collector.table() if collector else None
     late = late_readings(log, factors, voyage.start_ns, end_ns)
@@ -235,7 +236,7 @@ def run_log(
         None if ending.t_ns is None else (ending.t_ns - voyage.start_ns) * 1e-9,
         online,
         smoothed,
-        np.array(recorder.step_ns, np.int64),
+        step_ns,
         np.array(recorder.belief_ns, np.int64),
         finish_ns[0],
         counts,
@@ -245,7 +246,7 @@ def run_log(
         (*notes, *noticed(log, counts, estimator)),
         innovations_found,
         ending.traceback,
-        (np.array(recorder.step_cpu_ns, np.int64) - _of_driving_ns(voyage)).clip(0),
+        (np.array(recorder.step_cpu_ns, np.int64) - _of_driving_ns(voyage)).clip(0, step_ns),
         finish_ns[1],
     )
 
@@ -289,7 +290,8 @@ def _checked(online: Trajectory | None, ending: Ending) -> tuple[Trajectory | No
 def _drive(run: Pass, voyage: Voyage, recorder: Recorder, limit_ns: float, collector: NisCollector | None) -> Ending:
     """Hand over every epoch, in halves for a collector; time `step` and `belief` apart, and collect garbage outside.
 
-    The processor's clock takes up to 0.6 µs to read. It is read once a step, so what is kept has this loop in it.
+    The processor's clock takes up to 0.6 µs to read. It is read once a step, so what is kept has this loop in it. That
+    is taken off later, as an idle step has it, and varies: a step has at most the time that it took.
     """
     clock, cpu, step = perf_counter_ns, thread_time_ns, run.step
     step_ns, step_cpu_ns = recorder.step_ns.append, recorder.step_cpu_ns.append

@@ -275,6 +275,7 @@ def test_costs_add_up(log: Log) -> None:
     assert row["real_time_factor"] == pytest.approx(30.0 / row["total_s"])
     assert row["us_per_imu_sample"] == pytest.approx(1e6 * row["total_s"] / 3000)
     assert result.step_cpu_ns.shape == result.step_ns.shape
+    assert (result.step_cpu_ns <= result.step_ns).all()
     assert row["cpu_s"] < 0.5 * row["total_s"]  # a sleeping thread does not work
     assert row["step_cpu_median_us"] == pytest.approx(np.median(result.step_cpu_ns) / 1e3)
     outputs_s = 30.0 * 50 * result.belief_ns.mean() * 1e-9
