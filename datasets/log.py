@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -83,12 +82,12 @@ class ImuStream:
         """(n,) how long samples are missing before each sample, 0 where none is; see `imu_time`."""
         return gaps_ns(self.t_ns)
 
-    @cached_property
+    @property
     def start_ns(self) -> int:
         """Start of the first sample's interval."""
         return int(self.t_ns[0]) - first_sampling_ns(self.t_ns)
 
-    @cached_property
+    @property
     def period_ns(self) -> int:
         """Typical sampling interval: the median of `sampling_ns`."""
         return int(np.median(self.sampling_ns))

@@ -80,14 +80,14 @@ def equivalent_samples(
     rate_arm, lever, step, reached, lacking = vectors[6], vectors[7], vectors[8], vectors[9], vectors[10]
     R, R_last, turn, J = matrices[0], matrices[1], matrices[2], matrices[3]
     identity(R)
-    arm_velocity(before[0], rates[0], g, rate_arm)
+    arm_velocity(before[0], rates[0], g, lever, rate_arm)
     for k in range(n):
         dt = dts[k + 1]
         increments(rates, forces, dts, k, phi, push, drift)
         exp_into(phi, turn)
         for i in range(3):
             push[i] += rate_arm[i]
-        arm_velocity(imu[k], rates[k + 1], g, rate_arm)
+        arm_velocity(imu[k], rates[k + 1], g, lever, rate_arm)
         transform_into(turn, rate_arm, lever)
         for i in range(3):
             push[i] -= lever[i]

@@ -175,8 +175,8 @@ def integrate(
         product_into(R_mid[k], half, R)
         T += dt
 
-    arm_velocity(before[0], rates[0], g, c_i)
-    arm_velocity(imu[n - 1] if n else before[0], rates[n], g, c_j)
+    arm_velocity(before[0], rates[0], g, drift, c_i)
+    arm_velocity(imu[n - 1] if n else before[0], rates[n], g, drift, c_j)
     block.T = T
     for i in range(3):  # from I to B: v and p are now of the block's end
         for j in range(3):
@@ -208,12 +208,11 @@ def unbiased(
 
 
 @inner
-def arm_velocity(row: Any, rate: Array, g: Any, out: Array) -> None:
+def arm_velocity(row: Any, rate: Array, g: Any, w: Array, out: Array) -> None:
     """Fill out (3,) with ω × l at the end of a sample whose mean is `rate`, rad/s in B; docs/conventions.md (24).
 
-    `g` is one record of RIG.
+    `g` is one record of RIG, and w (3,) becomes ω, in B.
     """
-    w = np.empty(3)
     for i in range(3):
         w[i] = rate[i]
         for j in range(3):

@@ -16,7 +16,7 @@ from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.finding import Finding
 from ..findings.fitting import Mask
-from ..streams.channels import Channel, channels_of
+from ..streams.channels import Channel, channels_of, imu_period_ns
 from ..streams.frozen import SAME_ANGLE, frozen_findings
 from ..streams.missing import missing_rows, readings_of
 from ..streams.neighbours import outliers, residuals, robust_sigma, stretches
@@ -76,7 +76,7 @@ def _moves(log: Log, channel: Channel) -> bool:
     name, dvl, seen = channel.stream, log.dvl, []
     if name == "heading":
         up = np.median(log.imu.f_I, axis=0)
-        seen = [np.cumsum(log.imu.w_WI_I @ up / max(float(np.linalg.norm(up)), 1e-9)) * log.imu.period_ns * 1e-9]
+        seen = [np.cumsum(log.imu.w_WI_I @ up / max(float(np.linalg.norm(up)), 1e-9)) * imu_period_ns(log.imu) * 1e-9]
     elif dvl is not None and name in ("depth", "gps") and len(dvl):
         rate = dvl.z[:, 2] if name == "depth" else np.linalg.norm(dvl.z[:, :2], axis=1)
         seen = [np.cumsum(rate[1:] * np.diff(dvl.t_ns) * 1e-9)]

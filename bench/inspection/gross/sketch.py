@@ -10,7 +10,7 @@ import numpy as np
 from ....datasets.log import Log
 from ....datasets.state import Array
 from ..findings.fitting import Mask, Plane
-from ..streams.channels import seconds
+from ..streams.channels import imu_period_ns, seconds
 
 FINEST_S = 0.5
 """Vibration averages out over it, and a vehicle still tilts and turns within a few of them."""
@@ -131,7 +131,7 @@ class Sketch:
 
 def sketch_of(log: Log) -> Sketch | None:
     """Return a log on a coarse grid; None if it has fewer than FEWEST_CELLS."""
-    period_s = log.imu.period_ns * 1e-9
+    period_s = imu_period_ns(log.imu) * 1e-9
     step_s = max(FINEST_S, log.duration_s / MOST_CELLS)
     size = max(round(step_s / period_s), 1)
     n = len(log.imu.t_ns) // size * size

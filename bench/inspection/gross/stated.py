@@ -9,7 +9,7 @@ from ....datasets.quantities import DEGREE
 from ....datasets.times import NS_PER
 from ..findings.finding import Finding
 from ..findings.fitting import MAD_TO_SIGMA
-from ..streams.channels import stated_sigma
+from ..streams.channels import imu_period_ns, stated_sigma
 
 SLOWEST_IMU_HZ = 2.0
 """Below this an IMU's samples say nothing of a vehicle's motion between them: its time is in another unit."""
@@ -33,7 +33,7 @@ SECOND_DIFFERENCE = np.sqrt(6.0)
 
 def time_findings(log: Log) -> list[Finding]:
     """Find streams whose times are in another unit than the IMU's."""
-    hz = 1e9 / log.imu.period_ns
+    hz = 1e9 / imu_period_ns(log.imu)
     spans = {name: int(s.t_ns[-1]) - int(s.t_ns[0]) for name, s in log.streams.items() if len(s) >= FEWEST}
     imu_ns = int(log.imu.t_ns[-1]) - int(log.imu.t_ns[0])
     factors = {name: factor for name, span in spans.items() if (factor := _unit_ratio(span / imu_ns)) is not None}

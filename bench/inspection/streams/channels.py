@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ....datasets.log import AttitudeStream, Log, ReadingStream
+from ....datasets.log import AttitudeStream, ImuStream, Log, ReadingStream
 from ....datasets.quantities import DEGREE
 from ....datasets.state import Array, TimeArray
 from .quantisation import Quantisation, quantisation_of
@@ -79,9 +79,21 @@ class Channel:
 
 
 @lru_cache(maxsize=1)
+def imu_period_ns(imu: ImuStream) -> int:
+    """Return an IMU's typical sampling interval, ns; the checks ask for it often, and it takes a millisecond."""
+    return imu.period_ns
+
+
+@lru_cache(maxsize=1)
+def imu_start_ns(imu: ImuStream) -> int:
+    """Return the start of an IMU's first interval, ns; the checks ask for it hundreds of times."""
+    return imu.start_ns
+
+
+@lru_cache(maxsize=1)
 def channels_of(log: Log) -> tuple[Channel, ...]:
     """Return the channels of every stream that is there: gyro, accel, dvl, depth, gps, heading."""
-    noise, root_s = log.rig.imu_noise, float(np.sqrt(log.imu.period_ns * 1e-9))
+    noise, root_s = log.rig.imu_noise, float(np.sqrt(imu_period_ns(log.imu) * 1e-9))
     gyro, accel = np.full(3, noise.gyro_density / root_s), np.full(3, noise.accel_density / root_s)
     return (
         Channel("imu", "gyro", "gyro", log.imu.t_ns, log.imu.w_WI_I, gyro, "rad/s", 1.0, XYZ),
@@ -118,4 +130,5 @@ def _turned(stream: AttitudeStream) -> Array:
 
 def seconds(log: Log, t_ns: TimeArray) -> Array:
     """Return times from the log's start, s."""
-    return np.asarray((t_ns - log.start_ns) * 1e-9, dtype=np.float64)
+    start_ns = imu_start_ns(log.imu) if log.prior is None else log.prior.t_ns
+    return np.asarray((t_ns - start_ns) * 1e-9, dtype=np.float64)
